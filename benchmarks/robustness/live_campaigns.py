@@ -101,18 +101,15 @@ def campaigns(seed: int) -> Iterator[Record]:
     }
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=harness.count, default=100, help="number of arms")
     parser.add_argument("--first", type=int, default=0, help="the first of them")
     given = parser.parse_args()
     seeds = range(given.first, given.first + (1 if given.quick else given.seeds))
+    records = (one for seed in seeds for one in campaigns(seed))
 
     def program() -> None:
-        harness.report((one for seed in seeds for one in campaigns(seed)), given.out, COLUMNS)
+        harness.report(records, given.out, COLUMNS)
 
     harness.guarded(program)
-
-
-if __name__ == "__main__":
-    main()

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.planning.candidates import candidates as drawn
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.campaign.model import CampaignModel
 from diffeo_calib.campaign.planned import Next, planned
-from diffeo_calib.campaign.verdicts import LIMITS, Verdict
+from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
@@ -230,6 +230,3 @@ def _positions(q: object, y: object) -> Measurements:
 
 def _joints(robot: Tree, values: object) -> Tensor:
     return robot.joint_values(values).detach()  # pyright: ignore[reportArgumentType]
-
-
-

@@ -56,8 +56,8 @@ class CampaignModel:
         placed: geometry and devices. data: the rows they were found with. scales: of the model.
         next_scales: number of accepted rows at which scales are selected again. count: accepted rows of this model.
         seen: rows of the campaign at that time. asked: candidates (M, n) and target (T, n), rad or m.
-        posterior: of the accepted rows but the last ones. window: numbers of the last rows. last: these, as the posterior predicts them.
-        taken: (W,) boolean: those that were accepted.
+        posterior: of the accepted rows but the last ones. window: numbers of the last rows.
+        last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
         compared: see :func:`_compared`. ratios: of the squares of accepted rows, see :attr:`Measure.ratio`.
     """
 
@@ -171,9 +171,11 @@ class CampaignModel:
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause))
         change = None if cause else self._change(around, seen, verdicts, typical)
         if change is not None:
-            for number in range(change.row, row + 1):
-                if not (verdicts[number].cause or verdicts[number].decided):
-                    verdicts[number] = replace(verdicts[number], fits=False, accepted=False, change=change)
+            for number in self.window:
+                own, before = verdicts[number], number < change.row
+                if own.change is not None or not (before or own.cause or own.decided):
+                    accepted = before and bool(own.fits)
+                    verdicts[number] = replace(own, accepted=accepted, change=None if before else change)
         self._move_on(seen, verdicts)
 
     @property
@@ -203,7 +205,7 @@ class CampaignModel:
         """What changed among the last rows."""
         own = [verdicts[number] for number in self.window]
         known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        return find_change(seen, self.window, around.causes(), known, doubted, typical)
+        return find_change(seen, self.window, around.causes(), (known, doubted), typical=typical)
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -292,7 +294,7 @@ def _compared(placed: Placed, target: Rows) -> Tensor:
 
     Without a measuring device rigid motions of all of them do not.
     """
-    count, m = target.target.shape
+    count = len(target)
     whole = torch.block_diag(*origins(placed.lever, target.target).expand(count, -1, -1))
     if not placed.free:
         return whole

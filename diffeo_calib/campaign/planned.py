@@ -62,6 +62,7 @@ def _greedy(model: CampaignModel, steps: int) -> tuple[list[int], list[float]]:
         low = torch.linalg.cholesky(own[mine, mine])
         by = torch.linalg.solve_triangular(low, own[mine], upper=False)
         C, own = C - torch.linalg.solve_triangular(low, C[:, mine].T, upper=False).T @ by, own - by.T @ by
+        own[mine, mine] = torch.eye(r, dtype=own.dtype, device=own.device)  # it is known now
         order.append(best)
         variances.append(max(variances[-1] - float(gains[best]) / len(J), 0.0))
     return order, variances

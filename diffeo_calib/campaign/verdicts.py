@@ -31,8 +31,8 @@ class JudgementLimits:
     """When a row counts as wrong, and when a cause is named.
 
     Args:
-        chance: probability that a right row counts as wrong. undone: the same of a row whose mistake is undone. change: that chance gains as much as a named change.
-        remaining: probability, by chance, of the errors that a named change leaves.
+        chance: probability that a right row counts as wrong. undone: the same once its mistake is undone.
+        change: probability that chance gains as much as a named change. remaining: probability, by chance, of the errors that a named change leaves.
         fewest_rows: rows after a change. window: last rows among which changes are sought.
         spare: numbers beyond the unknowns of a change that must show it.
         typical_rows: last accepted rows whose squares, at this share of them, say how large right ones are relative
@@ -75,7 +75,8 @@ class Change:
 
     def __str__(self) -> str:
         others = "".join(f", or {name}" for name in self.others)
-        return f"{self.cause}{others} has changed by about {self.size:.2g} {self.unit} before row {self.row}; {self.fix}"
+        by = f"{self.size:.2g} {self.unit} before row {self.row}"
+        return f"{self.cause}{others} has changed by about {by}; {self.fix}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ class Verdict:
     """What a campaign thinks of a row.
 
     Args:
-        row: its number. fits: whether it does; None if it could not be judged yet. accepted: whether it was taken in.
+        row: its number. fits: whether it is where the accepted rows before it predict it; None if they could not yet.
+        accepted: whether it was taken in.
         error: how far it is from its prediction, m: RMS of its numbers. expected: the same as expected.
         cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
         expected_error: error of the robot over the target after this row, m; None before the first model.
@@ -104,7 +106,8 @@ class Verdict:
         if self.fits is None:
             return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}"
         size = f"{1e3 * self.error:.3g} mm from its prediction, {1e3 * self.expected:.2g} mm are usual"
-        text = f"row {self.row} {'fits' if self.fits else 'looks wrong'}: {size}{self.cause and f'; {self.cause}'}"
+        how = "fits" if self.fits and self.change is None else "looks wrong"
+        text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
         return text if self.change is None else f"{text}; {self.change}"
 
 
@@ -154,8 +157,8 @@ def find_change(
     seen: Seen,
     numbers: list[int],
     causes: Sequence[Cause],
-    known: Tensor,
-    doubted: Tensor,
+    flags: tuple[Tensor, Tensor],
+    *,
     typical: float,
     limits: JudgementLimits = LIMITS,
 ) -> Change | None:
@@ -163,9 +166,10 @@ def find_change(
 
     Args:
         seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, m, U) on them, m.
-        known: (N,) boolean: the rows that were accepted. doubted: (N,) those that a change may explain.
+        flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
         typical: see :meth:`Measure.fits`.
     """
+    known, doubted = flags
     owner, visible, found = seen.rows.owner, seen.rows.visible.flatten(), []
     for first in range(len(numbers) - limits.fewest_rows + 1):
         after = (owner >= first) & doubted[owner]

@@ -233,8 +233,9 @@ class Placed:
             for one in placement:
                 table = one.at_places(table)
             coordinates = coordinates._replace(table=table)
-        count, points = len(data if coordinates is None else coordinates.rows), self.identification.tails.weights.shape[1]
-        found = replace(self.identification, tails=Tails.none(count, points))
+        count = len(data if coordinates is None else coordinates.rows)
+        tails = Tails.none(count, self.identification.tails.weights.shape[1])
+        found = replace(self.identification, tails=tails)
         own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held)
