@@ -31,23 +31,13 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.placement import rigid_fit
 
-FAR_RATIO = 3.0
-"""Ratio of the error expected anywhere in the joint ranges to that at the rows, from which the difference is told."""
-MOST_ROWS = 256
-"""Of a fit, whose mean is the error at its configurations."""
-
 
 def workspace_deviation(fitted: FittedMap) -> float:
     """Root mean square distance, m, between modelled and true positions that the model expects over its workspace.
 
     Of the last marker, the ball.
     """
-    return expected_deviation(fitted, fitted.everywhere)
-
-
-def expected_deviation(fitted: FittedMap, q: Tensor) -> float:
-    """The same over some configurations (N, n)."""
-    covariance = fitted.posterior(q, noise=False)[1]
+    covariance = fitted.posterior(fitted.everywhere, noise=False)[1]
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
 
 
@@ -68,13 +58,10 @@ class ExpectedError:
     Args:
         workspace: root mean square distance, m, between its positions of the last marker and the true ones over the
             joint ranges of the rows; without a measuring device after the best rigid motion.
-        measured: the same over configurations of the rows themselves. Where the rows leave directions open, a marker
-            along an axis that the tool never turned away from, it says how good the model is for such motions only.
         size: standard deviation of the robot's size, relative. size_share: its part of ``workspace``, from 0 to 1.
     """
 
     workspace: float
-    measured: float
     size: float
     size_share: float
 
@@ -88,23 +75,11 @@ class ExpectedError:
         weight = (away / away.square().sum()).flatten()
         deviation = float((weight @ covariance @ weight).clamp(min=0).sqrt())
         spread, expected = float(away.square().sum(1).mean().sqrt()), workspace_deviation(fitted)
-        rows = fitted.x[:: -(-len(fitted.x) // MOST_ROWS)]
-        measured = expected_deviation(fitted, rows)
-        return cls(expected, measured, deviation, min(deviation * spread / max(expected, 1e-12), 1.0))
+        return cls(expected, deviation, min(deviation * spread / max(expected, 1e-12), 1.0))
 
     def entry(self) -> dict[str, object]:
         """For programs."""
-        found = {"expected_error_m": self.workspace, "expected_error_at_rows_m": self.measured}
-        return {**found, "size_deviation": self.size}
-
-    @property
-    def sentence(self) -> str:
-        """Both errors, and what to do where they differ much."""
-        near, far = 1e3 * self.measured, 1e3 * self.workspace
-        found = f"{near:.3f} mm RMS at the measured configurations, {far:.3f} mm anywhere in their joint ranges"
-        if far < FAR_RATIO * near:
-            return found
-        return f"{found}: use the model near those, or measure others, see `diffeo-calib plan`"
+        return {"expected_error_m": self.workspace, "size_deviation": self.size}
 
 
 def expected_errors(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
+from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.record import record
@@ -190,7 +190,8 @@ def stage_line(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tenso
 
 
 def expectation_lines(model: CalibratedKinematics, data: Any) -> Iterator[str]:
-    """The error that a model expects of itself, and which errors of the rows do not show it without a device."""
-    alone, expected = model.map.workspace is not None, ExpectedError.of(model.map)
-    yield f"expected {'absolute ' * alone}error{', after a rigid fit' * alone}: {expected.sentence}"
+    """The absolute error that a model expects, and which errors of the rows do not show it without a device."""
+    alone, expected = model.map.workspace is not None, 1e3 * workspace_deviation(model.map)
+    fitted = ", after a rigid fit" * alone
+    yield f"expected absolute error over the joint ranges of the fit{fitted}: {expected:.3f} mm RMS"
     yield from dict.fromkeys(part.flattery for part in data.parts * alone)

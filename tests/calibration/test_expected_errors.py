@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors, workspace_deviation
+from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
 from diffeo_calib.robots.se3 import twist_transform
 
 FAR = twist_transform(torch.tensor([0.03, -0.02, 0.01, 0.02, 0.01, -0.03], dtype=torch.float64))
@@ -59,24 +59,3 @@ def test_residual_and_shifts_of_a_fit_leave_its_noise() -> None:
     own = torch.linalg.solve(noise.covariance, (fit.residual - noise.shared @ fit.shifts)[..., None])[..., 0]
     torch.testing.assert_close(noise.solve(fit.residual), own, rtol=1e-6, atol=1e-6 * float(own.abs().max()))
     assert float(fit.shifts.norm()) > 0
-
-
-def test_rows_of_one_orientation_are_known_although_the_marker_is_not() -> None:
-    """A planar arm whose last joint keeps the tool's orientation: its marker is an offset of the base."""
-    robot = dc.from_dh([(0.5, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.0, 0.0)])
-    draw = torch.Generator().manual_seed(0)
-    q = torch.rand(60, 3, dtype=torch.float64, generator=draw) * 2 - 1
-    q[:, 2] = -q[:, 0] - q[:, 1]
-    marker = torch.tensor([0.03, 0.05, 0.02], dtype=torch.float64)
-    poses = robot(q)
-    points = (poses[:, :3, :3] @ marker + poses[:, :3, 3])[:, None]
-    points = points + 2e-5 * torch.randn(points.shape, dtype=torch.float64, generator=draw)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the marker's place is open
-        model = dc.calibrate(robot, dc.Measurements(q, points, robot.joint_names)).model
-    found = ExpectedError.of(model.map)
-    assert found.measured < 1e-4
-    assert found.workspace > 1e-3
-    assert "use the model near those" in found.sentence
-    turned = q + torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    assert float(model.predict(turned)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()) > 1e-3

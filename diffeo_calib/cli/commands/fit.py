@@ -106,7 +106,7 @@ def run(
     wrong = [] if held_out is None else _contradicted(result.model, held_out)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
-    for line in _lines_about_places(result, data, in_train, held_out, hand_eye):
+    for line in _lines_about_places(result, data, held_out, hand_eye):
         say(line)
     for one in (held_out or {}).values():
         if one.one.what == ERRORS:
@@ -138,7 +138,7 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
 
 
 def _lines_about_places(
-    result: CalibrationResult, data: Any, in_train: Errors, held_out: Errors | None, hand_eye: HandEye | None
+    result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: HandEye | None
 ) -> Iterator[str]:
     """What was hidden, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
@@ -151,8 +151,7 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    if any(one.one.what != ERRORS for one in in_train.values()):  # else errors of positions are above
-        yield stage_line(result.model, result.stages)
+    yield stage_line(result.model, result.stages)
     yield from expectation_lines(result.model, data)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
-from diffeo_calib.calibration.expected_errors import FAR_RATIO, STILL_RANGE
+from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.measurements.body_kinds import body_kind
@@ -16,6 +16,8 @@ from diffeo_calib.reports.plots.joints import in_bins, joint_values
 
 ENOUGH = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
+FAR_RATIO = 3.0
+"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 BLAMED = 0.5
 """Share of the expected variance that knowing the markers would remove, from which they are blamed."""
 OPEN_M = 1e-3
