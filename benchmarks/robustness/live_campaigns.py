@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all b
 import copy
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import harness
 import numpy as np
@@ -107,9 +108,5 @@ if __name__ == "__main__":
     parser.add_argument("--first", type=int, default=0, help="the first of them")
     given = parser.parse_args()
     seeds = range(given.first, given.first + (1 if given.quick else given.seeds))
-    records = (one for seed in seeds for one in campaigns(seed))
-
-    def program() -> None:
-        harness.report(records, given.out, COLUMNS)
-
-    harness.guarded(program)
+    found = (one for seed in seeds for one in campaigns(seed))
+    harness.guarded(partial(harness.report, found, given.out, COLUMNS))  # pyright: ignore[reportArgumentType]

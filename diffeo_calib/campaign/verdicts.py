@@ -32,7 +32,8 @@ class JudgementLimits:
 
     Args:
         chance: probability that a right row counts as wrong. undone: the same once its mistake is undone.
-        change: probability that chance gains as much as a named change. remaining: probability, by chance, of the errors that a named change leaves.
+        change: probability that chance gains as much as a named change.
+        remaining: probability, by chance, of the errors that a named change leaves.
         fewest_rows: rows after a change. window: last rows among which changes are sought.
         spare: numbers beyond the unknowns of a change that must show it.
         typical_rows: last accepted rows whose squares, at this share of them, say how large right ones are relative
