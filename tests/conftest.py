@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import Command
+from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
 from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot, with_usual_scales
 
@@ -58,6 +58,12 @@ def slider() -> Case:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     return Command(capsys, monkeypatch)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without pictures, for tests that look at their text and numbers."""
+    leave_undrawn(monkeypatch)
 
 
 @pytest.fixture
