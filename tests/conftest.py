@@ -72,7 +72,7 @@ def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
-BY_KIND = ("test_matrix.py", "test_kinds_judged.py")
+BY_KIND = ("test_matrix.py", "test_kinds_judged.py", "test_campaign.py")
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,
