@@ -62,7 +62,7 @@ def campaign_command(
     rows: options.Rows,
     given: options.LiveOptions,
 ) -> None:
-    """Judge rows while they are measured, and say when the robot is known well enough.
+    """Judge rows while they are measured.
 
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and the
     best poses to measure next. A journal beside the table keeps what was decided: after a crash the same command goes
