@@ -31,8 +31,6 @@ OUTLIER = 3.5
 """Errors of corners, in standard deviations of their image, from which they lose their weight."""
 ROUNDS, STEPS = 6, 30
 CONVERGED, DAMPED = 1e-10, 1e10
-LARGEST_TURN_RAD = 0.03
-"""Of a board, and shift relative to its distance, up to which its image is linear."""
 SMALLEST_NOISE_PX = 1e-3
 PRIOR_IMAGE_CORNERS = 10.0
 """Corners of a usual image whose noise counts beside an image's own."""
@@ -175,30 +173,6 @@ def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | No
         if float((weights / before - 1).abs().nan_to_num(0.0).max()) < 1e-3:
             break
     return _result(_minimum(state, weights), weights)
-
-
-def seen_from(images: Images, found: Camera, poses: Tensor, near: Tensor) -> tuple[Sights, Tensor]:
-    """The same images, linearised at other poses, where a robot predicts the board; and (N, 6) shifts and turns there.
-
-    Axes of the errors turn with the pose, and depth and tilt of a board are known a hundred times worse than its place
-    across: a tilt that is wrong by some mrad makes errors across that count.
-
-    Args:
-        images: of one camera. found: lens and board that they show. poses: (N, 4, 4) of the board that they show.
-        near: (N, 4, 4) the predicted ones, m. Those from which no single step leads to the images stay as they were.
-    """
-    own = _State(images, found, poses, torch.zeros_like(found.root[0]))
-    weights = _weights(own)
-    state = replace(own, poses=near)
-    inverse, _, _, push, _ = _normal(state, weights)
-    steps = (inverse @ push[..., None])[..., 0]
-    close = steps[:, 3:].norm(dim=1) < LARGEST_TURN_RAD
-    close &= steps[:, :3].norm(dim=1) < LARGEST_TURN_RAD * poses[:, :3, 3].norm(dim=1)
-    state = replace(own, poses=torch.where(close[:, None, None], near, poses))
-    inverse, effect, _, push, _ = _normal(state, weights)
-    steps = (inverse @ push[..., None])[..., 0] * close[:, None]
-    rms = own.errors().square().sum(-1).nanmean(1).div(2).sqrt()
-    return Sights(found, state.poses, inverse, effect, rms), steps
 
 
 def first_guess(images: Images, board: BoardPrior) -> Camera:

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cameras.board import BoardPrior
-from diffeo_calib.cameras.images import Camera, Images, Sights, seen_from, sighted
+from diffeo_calib.cameras.images import Camera, Images, Sights, sighted
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.checks import check_rows, joint_table
-from diffeo_calib.measurements.pose_frames import inverse_poses, pose_jacobian
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.rows import RowTable, with_attributes
 
 if TYPE_CHECKING:
@@ -113,30 +112,6 @@ class ImageTable(RowTable):
             slopes = self._pose_slopes()
             yield self.camera, slopes @ self.pose_shared, slopes @ self.pose_covariance @ slopes.mT
 
-    def linearised_at(self, points: Tensor) -> Self:
-        """Rows whose images are linearised where the points (N, P, 3) of poses are predicted, m; others as they are.
-
-        The poses that the images show to first order, and errors with the axes of the predicted ones.
-        """
-        if self.camera is None or self.corners is None:
-            return self
-        images = Images(self.corners[..., :3], self.corners[..., 3:], self.camera.width, self.camera.height)
-        seen, sign = (inverse_poses, -1.0) if self.board is not None else (_same, 1.0)
-        poses = seen(self.frames[:, 0])
-        found, steps = seen_from(images, self.camera, poses, seen(poses_from_marks(points, self.lever)))
-        at = seen(found.poses)
-        slopes = self._slopes_at(at, found.poses)
-        moved = (slopes @ (sign * steps)[..., None])[..., 0].view_as(points)
-        shown = poses_from_marks(mark_points(at, self.lever) + moved, self.lever)
-        back = torch.linalg.pinv(self._slopes_at(shown, seen(shown))) @ slopes
-        known = {"pose_covariance": back @ found.covariance @ back.mT, "pose_shared": sign * (back @ found.shared)}
-        known |= {} if self.board is None else {"board": seen(shown)[:, :3, 3]}
-        return with_attributes(self, poses=shown, points=mark_points(shown, self.lever), **known)
-
-    def _slopes_at(self, frames: Tensor, boards: Tensor) -> Tensor:
-        """See :func:`pose_jacobian`: (N, 9, 6) at other frames, and poses of the board in the camera, (N, 4, 4)."""
-        return pose_jacobian(frames[:, None], self.lever, None if self.board is None else boards[:, :3, 3])[:, 0]
-
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
         away = self.frames[:, 0, :3, 3] if self.board is None else -self.board
@@ -152,10 +127,6 @@ class ImageTable(RowTable):
 
     def _pose_slopes(self) -> Tensor:
         return pose_jacobian(self.frames, self.lever, self.board)[:, 0]
-
-
-def _same(poses: Tensor) -> Tensor:
-    return poses
 
 
 def image_columns(q: Tensor, corners: object, known: KnownCamera, *, camera_on_tool: bool) -> dict[str, Any]:

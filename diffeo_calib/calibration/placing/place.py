@@ -279,7 +279,6 @@ def _by_coordinates(
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
-    table = table.linearised_at(stages[1].geometry.points(table.q))
     cameras = LensAndBoard.of_table(table, own.rows, stages[0])
     placement = Placement((*sessions, *sockets, *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)

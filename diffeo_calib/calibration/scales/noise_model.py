@@ -43,12 +43,13 @@ SMALLEST_NOISE_M = 1e-7
 FREEDOM_OF_POSES = 6
 SLACK_SHARE = 0.1
 """Noise of the single points of a pose, relative to the residual of the geometric calibration."""
-KNOWN_SLACK_SHARE = 0.3
-"""The same relative to the smallest known error of a pose, along any of its six directions."""
 
 
 def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
-    """Median of the smallest known deviations of poses, m, of known covariances (N, R, R)."""
+    """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
+
+    A larger slack would drown what images of a board tell across the line of sight: a hundredth of the error along it.
+    """
     size = 0 if known is None else known.shape[1] // bodies
     if known is None or size < FREEDOM_OF_POSES:
         return otherwise
@@ -89,7 +90,7 @@ class NoiseModel:
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
         seen = bodies_of(data)
         known = data.covariance
-        slack = min(SLACK_SHARE * residual, KNOWN_SLACK_SHARE * _precision(known, seen.count, residual))
+        slack = min(SLACK_SHARE * residual, _precision(known, seen.count, residual))
         return cls(seen.count, 3 * seen.points, known, seen.modes, slack, visible=visible, kinds=seen.kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
