@@ -36,7 +36,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.robots.placement import rigid_fit
 
-POSES = 40
+POSES = 30
 TABLE = ["--length", "mm", "--angle", "deg"]
 
 
