@@ -40,8 +40,22 @@ from diffeo_calib.measurements.table import Measurements
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
+FREEDOM_OF_POSES = 6
 SLACK_SHARE = 0.1
 """Noise of the single points of a pose, relative to the residual of the geometric calibration."""
+
+
+def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
+    """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
+
+    A larger slack would drown what images of a board tell across the line of sight: a hundredth of the error along it.
+    """
+    size = 0 if known is None else known.shape[1] // bodies
+    if known is None or size < FREEDOM_OF_POSES:
+        return otherwise
+    smallest = torch.linalg.eigvalsh(own_blocks(known, bodies))[..., -FREEDOM_OF_POSES]
+    smallest = smallest[smallest > SMALLEST_NOISE_M**2]
+    return float(smallest.median().sqrt()) if len(smallest) else otherwise
 
 
 @dataclass(frozen=True)
@@ -75,8 +89,9 @@ class NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
         seen = bodies_of(data)
-        own = seen.count, 3 * seen.points, data.covariance, seen.modes, SLACK_SHARE * residual
-        return cls(*own, visible=visible, kinds=seen.kinds)
+        known = data.covariance
+        slack = min(SLACK_SHARE * residual, _precision(known, seen.count, residual))
+        return cls(seen.count, 3 * seen.points, known, seen.modes, slack, visible=visible, kinds=seen.kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
