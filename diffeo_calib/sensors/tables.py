@@ -123,8 +123,17 @@ def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: 
     return next((tip for table in tables if (tip := table.ball_tip) is not None), usual)
 
 
+SMALLEST_LEVER_M, LARGEST_LEVER_M = 0.01, 3.0
+"""Distances of the points of a pose with which positions and turns of a robot's tool both count."""
+
+
 def check_poses(data: Any) -> None:
-    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
+    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose, or for an odd lever."""
+    for lever in (getattr(part, "lever", None) for part in data.parts):
+        if lever is not None and not SMALLEST_LEVER_M <= lever <= LARGEST_LEVER_M:
+            expected = f"{1e3 * SMALLEST_LEVER_M:g} to {1e3 * LARGEST_LEVER_M:g} mm, about the size of the tool"
+            fix = "pass it in m (on the command line in the unit of lengths), or leave it out"
+            raise MeasurementError.of("`lever`", expected=expected, got=f"{1e3 * lever:g} mm", fix=fix)
     kinds = dict.fromkeys(part.kind for part in data.parts)
     if "pose" in kinds and len(kinds) > 1:
         got = " and ".join(f"{kind}s" for kind in kinds)
