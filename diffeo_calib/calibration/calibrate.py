@@ -220,7 +220,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
-        devices.warn_of_weakness(fitted_map)
+        devices.warn_of_weakness(model)
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Step, out_of_step
-from diffeo_calib.calibration.expected_errors import expected_of
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
@@ -282,5 +282,5 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
         raise InputError.of("a limit in px", expected="rows of images", got=", ".join(found), fix=fix)
     if not any(one.what == "errors" for one in own):
         of = "expected over the joint ranges of the fit, no position was measured"
-        measured.append(Accuracy(expected_of(model), unit, of))
+        measured.append(Accuracy(ExpectedError.of(model).whole, unit, of))
     return max(measured, key=lambda one: one.value)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from math import hypot
 from typing import Any
 
 from torch import Tensor
@@ -114,10 +113,8 @@ class CalibrationResult:
     @cached_property
     def expected(self) -> ExpectedError:
         """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
-        found, worst = ExpectedError.of(self.model.map), doubtful(self.lengths)
-        if worst is None:
-            return found
-        return replace(found, workspace=hypot(found.workspace, worst.displacement * 3**0.5))
+        found, worst = ExpectedError.of(self.model), doubtful(self.lengths)
+        return found if worst is None else found.in_doubt(worst.displacement * 3**0.5)
 
     def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""

@@ -304,17 +304,17 @@ class FittedMap:
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
-        return self.conditional.posterior(self._parameters(which))[0]
+        return self.conditional.posterior(self.parameters_as_points(which))[0]
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
-        own, at = self._parameters(which), self.geodesic.linearise(x)
+        own, at = self.parameters_as_points(which), self.geodesic.linearise(x)
         between = self.covariance_between(at, own)  # (M m, k)
         known = self.conditional.posterior(own)[0]
         removed = (between * torch.linalg.solve(known, between.T).T).sum()
         return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
 
-    def _parameters(self, which: Tensor) -> Linearisation:
+    def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration."""
         at = self.geodesic.linearise(self.x[:1])
         nothing = at.sensitivity.new_zeros(1, len(which), at.sensitivity.shape[1])
@@ -324,6 +324,11 @@ class FittedMap:
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
         return self.conditional.covariance_between(at, other)
+
+    def joint_covariance(self, x: Tensor) -> Tensor:
+        """Posterior covariance of all coordinates of k1 at x (M, n) together: (M m, M m), m^2."""
+        points, at = self.geodesic.linearised_value(x)
+        return self.covariance_between(at.projected(torch.eye(self.m).to(points).expand(len(x), -1, -1)))
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.

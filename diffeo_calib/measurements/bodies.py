@@ -86,6 +86,10 @@ class Bodies(ABC):
         """(N, T, 9, 6) displacements of points by a shift and a turn, see :class:`NoiseModel`; None for markers."""
         return None
 
+    def modes_of(self, points: Tensor) -> Tensor | None:
+        """The same of other rows of the device, whose points (K, P, 3) are known, m; None for markers."""
+        return None
+
     @property
     def kinds(self) -> Tensor | None:
         """(N, B) int64, 1 for the ball in sockets beside bodies that a device saw, 0; None if all are of one kind."""
@@ -171,6 +175,15 @@ class Frames(Bodies):
     def modes(self) -> Tensor:
         """See :class:`Bodies`: zero where hidden."""
         return pose_jacobian(self.measured, self.lever, self.data.board).nan_to_num(0.0)
+
+    def modes_of(self, points: Tensor) -> Tensor:
+        """See :class:`Bodies`; a camera sees its board where it is in these rows."""
+        frames, seen = frames_of_points(points, self.lever), seen_board(self.data)
+        board = None
+        if seen is not None:
+            away = seen.origins.mean(0) - frames[:, 0, :3, 3]
+            board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
+        return pose_jacobian(frames, self.lever, board)
 
 
 def bodies_of(data: Measurements) -> Bodies:

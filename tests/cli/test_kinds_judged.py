@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 import torch
 from command_bank import Command
-from kind_bank import KINDS, Kind, kind_named
+from kind_bank import KINDS, UNITS, Kind, kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
@@ -115,3 +115,23 @@ def test_report_command(kind: Kind, command: Command, tmp_path: Path) -> None:
     done = command("report", kind.file, "-o", tmp_path / "p.html", "--data", csv_file, *given, "--json", page)
     assert done.code == 0, done.err
     jsonschema.validate(json.loads(page.read_text()), SCHEMA)
+
+
+@pytest.mark.parametrize("name", ["hidden markers", "mixture"])
+def test_commands_expect_the_same_error(name: str, command: Command, tmp_path: Path) -> None:
+    kind, out = kind_named(name), tmp_path / "out"
+    table, options = kind.table("new")
+    found = {
+        verb: command(verb, *given, "--json", tmp_path / verb)
+        for verb, given in {
+            "evaluate": (kind.file, table, *options),
+            "report": (kind.file, "-o", out),
+            "plan": (kind.file, *UNITS, "-n", 3, "--draw", 50, "--sensor", "tracker", "-o", out),
+        }.items()
+    }
+    expected = kind.result.expected
+    for verb, done in found.items():
+        assert done.code == 0, done.err
+        numbers = json.loads((tmp_path / verb).read_text())["results"]["expected_error"]
+        assert numbers["expected_error_m"] == pytest.approx(expected.workspace, rel=1e-6)
+        assert numbers["with_open_places_m"] == pytest.approx(expected.whole, rel=1e-6)

@@ -21,6 +21,7 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
@@ -119,7 +120,7 @@ class DeviceSet(ABC):
     def placed(self) -> PlacedDevices:
         """What a model keeps of them."""
 
-    def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
     def changes(self, data: SeenRows) -> Iterable[Cause]:

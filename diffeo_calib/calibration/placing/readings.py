@@ -30,7 +30,7 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
-from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -114,10 +114,10 @@ class ReadingDevices(DeviceSet):
         self.devices.numbers(own.table)  # refuses other devices
         return replace(self, data=own.table, rows=own.rows)
 
-    def warn_of_weakness(self, fitted: FittedMap) -> None:
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
-        if fitted.workspace is not None:
-            expected = ExpectedError.of(fitted)
+        if model.map.workspace is not None:
+            expected = ExpectedError.of(model)
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:

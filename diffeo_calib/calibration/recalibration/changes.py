@@ -23,7 +23,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.judgement import find_block
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.linearisation import Linearisation
@@ -248,6 +249,8 @@ LEVEL = 0.01
 FEWEST_ROWS = 5
 TOLD_APART = 4.0
 """Difference of likelihood ratios up to which the rows do not tell two offsets apart."""
+MOST_OUTLIERS = 0.5
+"""Share of the rows of a session that hardly count, from which it deviates as a whole."""
 RANGE_MARGIN = 0.02
 """Rows may lie outside of the old joint ranges by this share of them."""
 
@@ -265,6 +268,7 @@ class Change:
         probability: that chance makes any likelihood ratio as large.
         deviation: standard deviation of an offset; None for other parts.
         others: offsets that explain the rows as well.
+        where: the rows that show it, in words; empty if all do.
     """
 
     part: str
@@ -274,8 +278,13 @@ class Change:
     probability: float
     deviation: float | None = None
     others: tuple[str, ...] = ()
+    where: str = ""
 
     def __str__(self) -> str:
+        return f"{self.where}: {self._what}" if self.where else self._what
+
+    @property
+    def _what(self) -> str:
         sign, within = ("", "") if self.deviation is None else ("+", f" +- {1e3 * self.deviation:.1g}")
         size = f"{1e3 * self.size:{sign}.2g}{within} mm"
         if self.angle:
@@ -326,15 +335,69 @@ class Drift(NamedTuple):
     variance: float
 
 
+SOMETHING = "something"
+"""A change whose part rows do not tell."""
+
+
 def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
-    """Test new rows for changes.
+    """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
+
+    Rows that follow one another, or are a session of their own, and deviate together are no outliers.
 
     Args:
         rows: seen by the old model. level: see :class:`Changes`. seed: of the samples.
 
     Returns:
-        what was found, and what may drift.
+        what was found, and what may drift: nothing where only a part of the rows shows a change.
     """
+    changes, drifts = _changes_of(rows, level=level, seed=seed)
+    groups = groups_of(rows)
+    if changes.found or not groups:
+        return changes, drifts
+    found = []
+    for where, group in groups.items():
+        own, _ = _changes_of(rows.kept(group.rows), level=level / len(groups), seed=seed)
+        found += [replace(one, where=where) for one in own.found]
+        if group.deviates and not own.found:
+            found.append(_unknown(rows.kept(group.rows), where, level))
+    return replace(changes, found=tuple(found)), []
+
+
+class Group(NamedTuple):
+    """Rows that were measured together: their numbers, and whether hardly any of them fits the old model."""
+
+    rows: Tensor
+    deviates: bool
+
+
+def groups_of(rows: NewRows) -> dict[str, Group]:
+    """Sessions, if there are several, and else the block of rows that hardly count, by their names."""
+    data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
+    if not rows.before.sessions:
+        numbers = data.line_numbers if len(data.line_numbers.unique()) == len(data) else torch.arange(len(data))
+        order = numbers.to(HOST).argsort()
+        place = find_block(flags[order])
+        if place is None or place[1] - place[0] < FEWEST_ROWS:
+            return {}
+        lines = numbers[order][place[0] : place[1]].tolist()
+        return {f"rows {lines[0]} to {lines[-1]}": Group(order[place[0] : place[1]], deviates=True)}
+    (frames,) = rows.before.sessions
+    found = {}
+    for number, name in enumerate(frames.names):
+        own = (frames.session == number).nonzero()[:, 0]
+        deviates = float(flags[own].double().mean()) > MOST_OUTLIERS
+        found[f"session '{name}'"] = Group(own, deviates=deviates)
+    return found
+
+
+def _unknown(rows: NewRows, where: str, level: float) -> Change:
+    """A change of rows that deviate together, of no part that is known."""
+    size = rows.rms(rows.residual)
+    return Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where)
+
+
+def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
+    """Test rows together; arguments as of :func:`find_changes`."""
     rows = rows.kept(within_old_range(rows))
     if len(rows) < FEWEST_ROWS:
         return Changes((), {}, 1.0, len(rows), level), []

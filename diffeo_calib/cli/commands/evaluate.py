@@ -137,11 +137,10 @@ def _say_places(places: Places) -> None:
 
 
 def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
-    """Known distances, and the absolute error to expect where no position was measured."""
+    """Known distances, and the absolute error to expect."""
     for errors in found.values():
         yield from socket_lines(errors, "all rows")
-    if any(errors is not found.positions for errors in found.values()):
-        yield from expectation_lines(model, data)
+    yield from expectation_lines(model, data)
 
 
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:

@@ -151,8 +151,8 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    yield stage_line(result.model, result.stages)
-    yield from expectation_lines(result.model, data)
+    yield stage_line(result.model, result.stages, result.expected)
+    yield from expectation_lines(result.model, data, result.expected)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
@@ -187,7 +187,6 @@ def _record(
         **entries_by_kind(
             {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
         ),
-        expected_error=result.expected.entry(),
         lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
         leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],

@@ -160,6 +160,14 @@ class RegisteredMap(FittedMap):
         """That of the fit alone, without the registration's."""
         return self.fitted.covariance_between(at, other)
 
+    def joint_covariance(self, x: Tensor) -> Tensor:
+        """That of the registration included, see :meth:`FittedMap.joint_covariance`."""
+        points, at = self.geodesic.linearised_value(x)
+        at, found = at.projected(torch.eye(self.m).to(points).expand(len(x), -1, -1)), self.registration
+        S = self.place_slopes(x)
+        cross = S @ (found.gain.to(S) @ self.fitted.covariance_between(self._rows, at))
+        return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT
+
     def _added(self, at: Linearisation, by_marker: Tensor | None) -> Tensor:
         """What the registration adds to the covariance: (M, m', m')."""
         found, device = self.registration, self.deformation.x.device
@@ -185,6 +193,13 @@ class RegisteredMap(FittedMap):
         shifts = variances[6:].view(-1, 3).sum(1) if with_markers else torch.zeros_like(turn)
         total = 0.75 * float(turn) ** 2 * squares + (turn * shifts).to(squares)
         return total.repeat_interleave(3, dim=1)
+
+    def place_slopes(self, q: Tensor) -> Tensor:
+        """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
+        rows = q.to(self.deformation.x.device)
+        points = self.geodesic(rows).detach().view(len(rows), -1, 3)
+        S = frame_slopes(points, self.registration.centre.to(points))
+        return torch.cat([S, marker_slopes(self.geodesic, self.points, rows)], -1).flatten(0, 1)
 
     @cached_property
     def _rows(self) -> Linearisation:

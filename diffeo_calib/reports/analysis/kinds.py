@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from diffeo_calib.calibration import expected_errors as workspace
+from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.result import Progress, silent
@@ -101,8 +101,9 @@ def find_kinds(
     progress("analysis", 1, STEPS)
     fitted, q = model.configurations.to(HOST), configurations(model, CONFIGURATIONS, 0)
     some = fitted[:: -(-len(fitted) // MEASURED)]
-    deviations = Deviations(q, claimed(model, q), some, claimed(model, some))
-    expected = workspace.expected_errors(model, stages)
+    error = ExpectedError.of(model)
+    deviations = Deviations(q, claimed(model, q), some, claimed(model, some), error)
+    expected = expected_errors(model, stages, error)
     progress("analysis", STEPS, STEPS)
     return KindFindings(model, kinds, new, devices, expected, deviations, parts(model))
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.robust_registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, plan
@@ -69,22 +70,24 @@ class Deviations:
         q: (M, n) random configurations in these ranges, rad or m.
         deviation: (M,) RMS distance of the markers that the model claims there, m.
         measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
+        error: what the model expects in all, as every command says it.
     """
 
     q: Tensor
     deviation: Tensor
     measured: Tensor
     measured_deviation: Tensor
+    error: ExpectedError
 
     @property
     def rms(self) -> float:
-        """RMS of the deviations anywhere in the ranges, m."""
-        return float(self.deviation.square().mean().sqrt())
+        """RMS error expected anywhere in the ranges, m, apart from what the rows leave open."""
+        return self.error.workspace
 
     @property
     def measured_rms(self) -> float:
-        """RMS of the deviations at configurations of the fit, m."""
-        return float(self.measured_deviation.square().mean().sqrt())
+        """RMS error expected at configurations of the fit, m."""
+        return self.error.measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +104,7 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
     fitted = fitted[:: -(-len(fitted) // MEASURED)]
     found = plan(model, q, NEXT, target=q[:TARGETS])
     deviation = found.known_rms if model.registration is None else claimed(model, q)
-    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), found)
+    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), ExpectedError.of(model), found)
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:

@@ -122,6 +122,7 @@ def _expected(found: KindFindings) -> Section:
         for joint, name in enumerate(robot.joint_names)
     ]  # fmt: skip
     see = "RMS errors of positions that the model itself expects over the joint ranges of its rows"
-    see += ", after a rigid fit, because no device says where the robot stands." * free + "." * (not free)
+    see += ", after a rigid fit, because no device says where the robot stands" * free
+    see += f": {printable(found.deviations.error.sentence)}."
     table = Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)
     return Section("expected", "What to expect", see, [table], None, pictures)

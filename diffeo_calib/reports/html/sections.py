@@ -133,7 +133,7 @@ def where(found: Findings) -> Section:
     see = (
         "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
         f"model itself expects, without the noise of a measurement: {rough_millimetres(expected.measured_rms)} mm RMS "
-        f"at the measured configurations, {rough_millimetres(expected.rms)} mm anywhere in the measured joint ranges."
+        f"at the measured configurations; anywhere in the measured joint ranges {printable(expected.error.sentence)}."
     )
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     then = rough_millimetres(float(expected.next.expected_rms[-1]))

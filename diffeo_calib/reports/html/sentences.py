@@ -84,7 +84,7 @@ def advice(found: Findings) -> Iterator[str]:
 
 def _unless_planned(found: Findings) -> str:
     """That planned poses help where more of the same do not, if they do."""
-    now, then = found.expected.rms, float(found.expected.next.expected_rms[-1])
+    now, then = (float(found.expected.next.expected_rms[count]) for count in (0, -1))
     if now < ENOUGH * then:
         return ""
     lower = f"from {rough_millimetres(now)} to {rough_millimetres(then)} mm"
@@ -94,7 +94,7 @@ def _unless_planned(found: Findings) -> str:
 def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
     expected, model = found.expected, found.model
-    if expected.rms < FAR_RATIO * expected.measured_rms:
+    if expected.error.whole < FAR_RATIO * expected.measured_rms:
         return
     tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
@@ -102,7 +102,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     variances = found.rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
     deviation, place = variances.sqrt().max(0)
     number, axis = divmod(int(place), 3)
-    far = rough_millimetres(expected.rms)
+    far = rough_millimetres(expected.error.whole)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
     if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
         what = body_kind(model.lever).name(number, len(found.rows.on))
