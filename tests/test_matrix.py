@@ -430,8 +430,6 @@ BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
 NOT_YET: dict[tuple[str, str], str] = {
-    **{("registered", kind): "refused" for kind in ("mixture", "several kinds")},
-    **{("evaluate --register", kind): "refused" for kind in ("mixture", "several kinds")},
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read
     **{("compare with a table", kind): "refused" for kind in ("images",)},
     **{("recalibrate", kind): "refused" for kind in ("images",)},

@@ -168,9 +168,9 @@ class CalibratedKinematics:
         Args:
             measurements: N configurations with markers or poses in the new measuring frame; of several sessions the
                 largest gives the frame, and the others are placed beside it. The number of markers may differ from that
-                of the fit, and there may be poses where there were markers or the other way round. Or a ball in
-                sockets, or readings, of a model of such rows: robot and ball stay, the new devices are placed around
-                them.
+                of the fit, and there may be poses where there were markers or the other way round. A ball in sockets,
+                or readings, of a model of such rows, alone or beside positions: the ball stays on the tool, and the
+                new devices are placed around the robot.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
                 decide between the same place, a small motion and other markers.
@@ -186,14 +186,15 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        rows = registration_rows(measurements)
+        rows = registration_rows(measurements, self)
         if rows is None:
             check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
-        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
-        device = self.configurations.device
-        seen = self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
+        ball = self.ball and bool(rows.points[:, -1].isnan().all())
+        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std, ball=ball)
+        known = {"map": found.to(self.configurations.device), "lever": found.registration.lever, "placement": ()}
+        seen = self._with(**known, ball=ball)._carrying(self.nominal.load)
         return seen._with(placement=devices_beside(seen, measurements))
 
     @property
