@@ -14,6 +14,7 @@ from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
 from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
@@ -346,6 +347,18 @@ class CalibratedKinematics:
         """
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
+
+    def predict_readings(self, q: object, *, noise: bool = True) -> list[PredictedReadings]:
+        """What the devices of the fit will read of the ball: distances, heights, images, each in its unit.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new reading (default) or of the model alone.
+
+        Returns:
+            one entry for every device; none for a model whose devices measure positions or poses, see :meth:`predict`.
+        """
+        return predicted_readings(self, self._joints(q).detach(), noise=noise)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
