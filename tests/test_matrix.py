@@ -428,9 +428,7 @@ WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
 BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
-NOT_YET: dict[tuple[str, str], str] = {
-    **{("init", kind): "refused" for kind in ("images", "images of a board", "several kinds")},
-}
+NOT_YET: dict[tuple[str, str], str] = {}
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
 """Verbs of seconds: but for positions and the table of several kinds they are slow tests."""

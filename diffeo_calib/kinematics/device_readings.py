@@ -17,9 +17,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.placed import PlacedDevices
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,20 +53,58 @@ class _Seen(NamedTuple):
     at: Linearisation
     sensitivity: Tensor | None
 
-    @property
-    def ball(self) -> Tensor:
-        return self.points[:, -3:]
 
+class _Device(NamedTuple):
+    """One of a set of devices.
 
-class _OfFit(NamedTuple):
-    """What a fit knows of one device: prior deviations (k,) of its unknowns, and their columns (c,) among the shifts.
-
-    ``noise``: (r, r) covariance of a reading, m^2.
+    Args:
+        devices, number: the set, and its number there. deviations: (k,) of its unknowns: by the prior of the fit if it
+            measured rows of the fit, else by the rows on which it was placed.
+        columns: (c,) boolean, its unknowns among the shifts of the fit. noise: (r, r) of a reading, m^2. Both None for
+            a device that measured no row of the fit.
     """
 
+    devices: Devices
+    number: int
     deviations: Tensor
-    columns: Tensor
-    noise: Tensor
+    columns: Tensor | None = None
+    noise: Tensor | None = None
+
+    @classmethod
+    def of(cls, fitted: FittedMap, own: PlacedDevices, devices: Devices, number: int) -> _Device:
+        """By its rows in the fit, unless the model was moved since."""
+        rows, placed = own.rows[own.device == number], cls(devices, number, own.deviations[number])
+        if not len(rows) or fitted.registration is not None or fitted.slopes is None:
+            return placed
+        numbers = fitted.noise.visible[rows][0]
+        effects = fitted.noise.shared[rows][:, numbers]  # (M, r, c)
+        columns = (effects != 0).any(1).any(0)
+        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3:])
+        if int(columns.sum()) != slopes.shape[2]:
+            return placed
+        deviations = (effects[..., columns].square().sum((0, 1)) / slopes.square().sum((0, 1))).sqrt()
+        noise = fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
+        return cls(devices, number, deviations, columns, noise)
+
+    def observation(self, rows: int) -> Observation:
+        """What so many rows of it observe, m."""
+        return self.devices.observation(torch.full((rows,), self.number, dtype=torch.int64, device=HOST))
+
+    def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
+        """Mean (N, r) and covariance (N, r, r) of its readings, m."""
+        ball, observation = seen.points[:, -3:], self.observation(len(seen.points))
+        A = torch.nn.functional.pad(observation.slope(ball), (seen.points.shape[1] - 3, 0))
+        B = observation.by_constants(ball) * self.deviations
+        if self.columns is None:
+            covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
+        else:
+            covariance = fitted.with_shifts(seen.at.projected(A), B, self.columns)
+        if seen.sensitivity is not None:
+            moved = A @ (seen.sensitivity @ fitted.open_directions)
+            covariance = covariance + moved @ moved.mT
+        if noise:
+            covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
+        return observation.value(ball), covariance
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
@@ -72,18 +113,20 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     Args:
         model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
     """
-    sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
     fitted: FittedMap = model.map
+    sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
+    if not sets:
+        return []
     seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in range(0, len(q), PREDICT_ROWS)]
     found = []
     for own, devices in sets:
         unit, scale, zero = own.shown_as
         for number, name in enumerate(own.names):
-            of_fit = _of_fit(fitted, devices, number, own.rows[own.device == number])
-            parts = [_readings(fitted, each, devices, number, of_fit, own.deviations[number], noise) for each in seen]
-            factor = torch.tensor(scale).to(q) / devices.metres[number].to(q)
-            mean = torch.cat([part[0] for part in parts]) * factor + torch.tensor(zero).to(q)
-            covariance = torch.cat([part[1] for part in parts]) * factor[:, None] * factor
+            device = _Device.of(fitted, own, devices, number)
+            means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)
+            factor = q.new_tensor(scale) / devices.metres[number]
+            mean = torch.cat(means) * factor + q.new_tensor(zero)
+            covariance = torch.cat(blocks) * factor[:, None] * factor
             found.append(PredictedReadings(own.kind, name, unit, mean, covariance))
     return found
 
@@ -92,42 +135,3 @@ def _seen(fitted: FittedMap, q: Tensor, some: slice) -> _Seen:
     geodesic = fitted.geodesic.at_rows(some)
     points, at = geodesic.linearised_value(q[some])
     return _Seen(points.detach(), at, fitted.open_sensitivity(geodesic.spec.nominal, q[some]))
-
-
-def _of_fit(fitted: FittedMap, devices: Devices, number: int, rows: Tensor) -> _OfFit | None:
-    """What the fit knows of a device by its rows (M,); None where it measured none, or the model was moved since."""
-    if not len(rows) or fitted.registration is not None or fitted.slopes is None:
-        return None
-    numbers = fitted.noise.visible[rows][0]
-    effects = fitted.noise.shared[rows][:, numbers]  # (M, r, c)
-    columns = (effects != 0).any(1).any(0)
-    ball = fitted.fitted_points[rows, -3:]
-    slopes = devices.observation(torch.full_like(rows, number)).by_constants(ball)
-    if int(columns.sum()) != slopes.shape[2]:
-        return None
-    deviations = (effects[..., columns].square().sum((0, 1)) / slopes.square().sum((0, 1))).sqrt()
-    noise = fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
-    return _OfFit(deviations, columns, noise)
-
-
-def _readings(
-    fitted: FittedMap, seen: _Seen, devices: Devices, number: int, of_fit: _OfFit | None, known: Tensor, noise: bool
-) -> tuple[Tensor, Tensor]:
-    """Mean (N, r) and covariance (N, r, r) of the readings of a device, m; ``known``: (k,) deviations of its unknowns."""
-    ball = seen.ball
-    observation = devices.observation(torch.full((len(ball),), number, dtype=torch.int64, device=ball.device))
-    A = torch.nn.functional.pad(observation.slope(ball), (seen.points.shape[1] - 3, 0))
-    B = observation.by_constants(ball)
-    if of_fit is None:
-        B = B * known.to(B)
-        covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
-    else:
-        B = B * of_fit.deviations
-        covariance = fitted.with_shifts(seen.at.projected(A), B, of_fit.columns)
-    if seen.sensitivity is not None:
-        moved = A @ (seen.sensitivity @ fitted.open_directions)
-        covariance = covariance + moved @ moved.mT
-    if noise:
-        own = A @ fitted.new_noise @ A.mT
-        covariance = covariance + (own if of_fit is None else of_fit.noise)
-    return observation.value(ball), covariance

@@ -95,7 +95,9 @@ def test_the_command_writes_lengths_in_the_unit_of_the_table(command: Command, t
     assert done.code == 0, done.err
     table = np.genfromtxt(written, delimiter=",", names=True, deletechars="")
     for own in kind.model.predict_readings(q):
-        columns = [f"{own.kind}_{own.device}{end}".replace(" ", "_") for end in (("",), ("_1", "_2"))[len(own.mean[0]) - 1]]
+        columns = [
+            f"{own.kind}_{own.device}{end}".replace(" ", "_") for end in (("",), ("_1", "_2"))[len(own.mean[0]) - 1]
+        ]
         for number, column in enumerate(columns):
             np.testing.assert_allclose(table[column], own.mean[:, number], atol=1e-3)
             np.testing.assert_allclose(table[f"std_{column}"], own.deviations[:, number], rtol=1e-2)

@@ -91,7 +91,7 @@ def test_positions_beside_a_ball_are_registered_with_their_devices(name: str) ->
     T = twist_transform(ELSEWHERE)
     for one, tolerance in ((registration.transform[:3, 3], 1e-3), (registration.transform[:3, :3], 2e-3)):
         assert_close(one, T[:3, 3] if one.ndim == 1 else T[:3, :3], rtol=0, atol=tolerance)
-    mean, covariance = found.predict(kind.q(5))
+    _, covariance = found.predict(kind.q(5))
     assert float(torch.linalg.eigvalsh(covariance).min()) > 1e-6**2  # the noise of a ball that no row shows, too
     assert {name for own in found.placement for name in own.names} >= {
         name for part in kind.moved.parts for name in part.device_names if name and part.kind != "mixture"

@@ -23,9 +23,9 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.evaluation import OutsideRange
 from diffeo_calib.measurements.body_kinds import body_kind
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
-from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.writing import Predictions, write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 

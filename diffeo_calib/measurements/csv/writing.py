@@ -29,7 +29,7 @@ from diffeo_calib.measurements.table_format import Names, TableFormat, flat_name
 Cells = Sequence[Sequence[float | str]]
 """Rows of cells: numbers and texts."""
 Predictions = tuple[Tensor, ...]
-"""Configurations (B, n) [rad or m], predicted points or poses, their standard deviations, and perhaps more cells (B, k)."""
+"""Configurations (B, n) [rad or m], predicted points or poses, standard deviations, and perhaps more cells (B, k)."""
 
 
 def write_predictions(
