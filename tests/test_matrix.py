@@ -427,18 +427,10 @@ def _(bench: Bench) -> None:
 # --- the table ------------------------------------------------------------------------------------------------------
 
 WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
-READ = ("distances", "heights", "images", "several kinds")
 BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
-NOT_YET: dict[tuple[str, str], str] = {
-    **{("registered", kind): "refused" for kind in ("mixture", "several kinds")},
-    **{("evaluate --register", kind): "refused" for kind in ("mixture", "several kinds")},
-    **{("predict", kind): "different" for kind in READ},  # not what their devices will read
-    **{("compare with a table", kind): "refused" for kind in ("images",)},
-    **{("recalibrate", kind): "refused" for kind in ("images",)},
-    **{("init", kind): "refused" for kind in ("images", "images of a board", "several kinds")},
-}
+NOT_YET: dict[tuple[str, str], str] = {}
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
 """Verbs of seconds: but for positions and the table of several kinds they are slow tests."""

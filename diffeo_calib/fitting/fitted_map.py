@@ -215,6 +215,29 @@ class FittedMap:
         """
         return self.conditional.covariance(at, directions)
 
+    def with_shifts(self, at: Linearisation, effects: Tensor, columns: Tensor) -> Tensor:
+        """Posterior covariance (M, r, r) of points together with shifts that rows of the fit shared.
+
+        Rigid motions that no device shows move the points and the shifts alike, and are no errors of their sum.
+
+        Args:
+            at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
+            columns: (c,) boolean, which of the shifts of the fit these are.
+        """
+        known = self.conditional
+        known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        own, shifts = known.features(at), known.shift_features()[:, columns]
+        signed = own.signs[:, None] * shifts  # (f, k)
+        with_shifts = (own.values.mT @ signed).view(*at.sensitivity.shape[:2], -1)
+        cross = with_shifts @ effects.mT
+        return known.posterior(at) + cross + cross.mT + effects @ (shifts.mT @ signed) @ effects.mT
+
+    @of_origin
+    def fitted_points(self) -> Tensor:
+        """(N, m) the map at the rows of the fit, each under its own payload, m."""
+        at_rows = self.geodesic.z1.view(-1, self.m) if self.data is None else self.geodesic(self.x)
+        return at_rows.detach()
+
     @of_origin
     def open_directions(self) -> Tensor:
         """Square root (K, k) of the prior covariance of theta in the k directions that the data leave open.

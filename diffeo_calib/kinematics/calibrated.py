@@ -14,6 +14,7 @@ from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
 from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
@@ -168,9 +169,9 @@ class CalibratedKinematics:
         Args:
             measurements: N configurations with markers or poses in the new measuring frame; of several sessions the
                 largest gives the frame, and the others are placed beside it. The number of markers may differ from that
-                of the fit, and there may be poses where there were markers or the other way round. Or a ball in
-                sockets, or readings, of a model of such rows: robot and ball stay, the new devices are placed around
-                them.
+                of the fit, and there may be poses where there were markers or the other way round. A ball in sockets,
+                or readings, of a model of such rows, alone or beside positions: the ball stays on the tool, and the
+                new devices are placed around the robot.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
                 decide between the same place, a small motion and other markers.
@@ -186,14 +187,15 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        rows = registration_rows(measurements)
+        rows = registration_rows(measurements, self)
         if rows is None:
             check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
-        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
-        device = self.configurations.device
-        seen = self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
+        ball = self.ball and bool(rows.points[:, -1].isnan().all())
+        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std, ball=ball)
+        known = {"map": found.to(self.configurations.device), "lever": found.registration.lever, "placement": ()}
+        seen = self._with(**known, ball=ball)._carrying(self.nominal.load)
         return seen._with(placement=devices_beside(seen, measurements))
 
     @property
@@ -345,6 +347,18 @@ class CalibratedKinematics:
         """
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
+
+    def predict_readings(self, q: object, *, noise: bool = True) -> list[PredictedReadings]:
+        """What the devices of the fit will read of the ball: distances, heights, images, each in its unit.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new reading (default) or of the model alone.
+
+        Returns:
+            one entry for every device; none for a model whose devices measure positions or poses, see :meth:`predict`.
+        """
+        return predicted_readings(self, self._joints(q).detach(), noise=noise)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
         """Poses of a tool centre point, which need not have been measured.

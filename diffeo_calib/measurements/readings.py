@@ -255,6 +255,14 @@ class Readings(RowTable):
         return None if self.std is None else self.std * self.std.new_tensor(self.intrinsics[: self.std.shape[1]])
 
     @property
+    def shown(self) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+        """Unit in which readings are shown, and what their r numbers are multiplied by and shifted by to be in it."""
+        r = self.values.shape[1]
+        if self.kind == "image":
+            return self.unit[0], self.intrinsics[:2], self.intrinsics[2:]
+        return self.unit[0], (self.unit[1],) * r, (0.0,) * r
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         names = {"kind": self.kind.encode(), "names": repr((self.names, self.offset_std)).encode()}

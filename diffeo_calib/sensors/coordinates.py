@@ -254,7 +254,7 @@ class OtherDevices(Sensor):
             expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
             raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
         deviations = found.open_deviations(data, points[:, -1])
-        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations),)
+        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
 
 
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}

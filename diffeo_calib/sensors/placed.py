@@ -19,6 +19,8 @@ SESSION, SOCKET = "session", "socket"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
 MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
+Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
+"""Unit in which r numbers are shown, and what they are multiplied by and shifted by to be in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class PlacedDevices:
         kind: "session", "socket", or that of readings.
         names: D names. constants: (D, c). deviations: (D, k) standard deviations of their increments, m or rad.
         rows: (M,) int64, rows of the fit that they measured. device: (M,) int64, which of them did.
+        shown: how their readings are shown; None for other kinds, and in files of old versions.
     """
 
     kind: str
@@ -37,12 +40,20 @@ class PlacedDevices:
     deviations: Tensor
     rows: Tensor
     device: Tensor
+    shown: Shown | None = None
 
     @classmethod
-    def outside(cls, kind: str, names: tuple[str, ...], constants: Tensor, deviations: Tensor) -> PlacedDevices:
+    def outside(
+        cls,
+        kind: str,
+        names: tuple[str, ...],
+        constants: Tensor,
+        deviations: Tensor,
+        shown: Shown | None = None,
+    ) -> PlacedDevices:
         """Devices that measured no row of the fit."""
         nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
-        return cls(kind, names, constants, deviations, nothing, nothing)
+        return cls(kind, names, constants, deviations, nothing, nothing, shown)
 
     def beside(self, other: PlacedDevices) -> PlacedDevices:
         """These, and those of the same kind with other names."""
@@ -57,6 +68,7 @@ class PlacedDevices:
             torch.cat([self.deviations, other.deviations[kept]]),
             torch.cat([self.rows, other.rows[rows]]),
             torch.cat([self.device, torch.tensor(device, dtype=torch.int64, device=HOST)]),
+            self.shown or other.shown,
         )
 
     @property
@@ -86,9 +98,14 @@ class PlacedDevices:
             for name, place in zip(self.names, places, strict=True)
         ]
 
+    @property
+    def shown_as(self) -> Shown:
+        """How readings are shown, for files of old versions as the devices report them, lengths in m."""
+        return self.shown or ("", (1.0,), (0.0,))
+
     def entry(self) -> dict[str, Any]:
         """For a file, in m and rad."""
-        found = {name: getattr(self, name) for name in ENTRIES}
+        found = {name: getattr(self, name) for name in ENTRIES} | ({} if self.shown is None else {"shown": self.shown})
         return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
 
     @classmethod
@@ -98,7 +115,7 @@ class PlacedDevices:
         Raises:
             InputError: entries that do not fit together.
         """
-        if not isinstance(entry, dict) or set(entry) != set(ENTRIES):
+        if not isinstance(entry, dict) or set(entry) - {"shown"} != set(ENTRIES):
             raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
         if not isinstance(entry["kind"], str):
             raise InputError.of("the kind of the devices of a model", expected="a text", got=entry["kind"])
@@ -109,4 +126,16 @@ class PlacedDevices:
         inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
         if len(numbers) != len(device) or not inside:
             raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
-        return cls(entry["kind"], names, constants, deviations, numbers, device)
+        return cls(entry["kind"], names, constants, deviations, numbers, device, _shown(entry.get("shown")))
+
+
+def _shown(entry: Any) -> Shown | None:
+    """The inverse of the entry of :attr:`PlacedDevices.shown`."""
+    if entry is None:
+        return None
+    try:
+        unit, scale, zero = entry
+        return str(unit), tuple(map(float, scale)), tuple(map(float, zero))
+    except (TypeError, ValueError):
+        expected = "a unit, factors and zeros"
+        raise InputError.of("how readings of a model are shown", expected=expected, got=repr(entry)) from None

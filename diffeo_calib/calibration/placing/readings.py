@@ -130,7 +130,7 @@ class ReadingDevices(DeviceSet):
         prior = self.devices.deviations.expand(len(self.devices.names), -1)
         deviations = prior if self.known is None else self.known
         own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
-        return PlacedDevices(self.devices.kind, *own)
+        return PlacedDevices(self.devices.kind, *own, self.data.shown)
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
@@ -157,12 +157,14 @@ class FoundReadings:
     devices: tuple[Devices, ...]
 
 
-def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
+def identify_readings(
+    bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False, ball: Tensor | None = None
+) -> FoundReadings:
     """Find ball, devices and geometric errors.
 
     Args:
         bare: the robot with one marker, the ball, whose place is not used. tables: readings, each of one kind.
-        rigid: whether errors of joints stay zero.
+        rigid: whether errors of joints stay zero. ball: (3,) where it was before, one more start of the search, m.
 
     Raises:
         MeasurementError: readings that no place of ball and devices explains.
@@ -173,7 +175,8 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
     for data, T in zip(tables, poses, strict=True):
         kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
-    found = _rough_fits(bare, tables, still, _starts(tables, poses))
+    starts = [] if ball is None else [(ball, _around(ball, tables, poses))]
+    found = _rough_fits(bare, tables, still, _starts(tables, poses) + starts)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
         found += _rough_fits(bare, tables, still, [(ball, _around(ball, tables, poses)) for ball in balls])
@@ -225,13 +228,17 @@ def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devi
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
-    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings."""
+    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings.
+
+    The search starts, among other places, where the last marker of the robot is.
+    """
     if not readings:
         return None
     for one in readings:
         check_devices(one)
     bare = geometry.with_tool(geometry.tool[:1] * 0.0, (tip,))
-    return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
+    before = geometry.tool[-1] if geometry.on[-1] == tip else None
+    return identify_readings(bare, readings, rigid=True, ball=before).identification.geometry.tool[0]
 
 
 def reading_sets(

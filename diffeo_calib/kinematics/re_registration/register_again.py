@@ -57,9 +57,10 @@ def register_again(
     *,
     free: str,
     marker_std: float | None,
+    ball: bool = False,
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std)
+    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std, ball=ball)
     registration = found.registration
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
@@ -88,14 +89,18 @@ def find_place(
     *,
     free: str = "both",
     marker_std: float | None = None,
+    ball: bool = False,
 ) -> FoundPlace:
-    """Find where the device stands and where the markers sit; arguments as of :func:`register_again`."""
+    """Find where the device stands and where the markers sit; arguments as of :func:`register_again`.
+
+    ``ball``: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+    """
     _check_arguments(nominal, data, free, marker_std)
     data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
     nominal = nominal.under(some.payload)
     model = model.with_nominal(nominal)
-    every = session_of(model, nominal, lever, some, free)
+    every = session_of(model, nominal, lever, some, free, ball=ball)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
     while True:
@@ -116,23 +121,16 @@ def find_place(
     return FoundPlace(registration, odds, found.best.inflation)
 
 
-def registration_rows(data: Any) -> Measurements | None:
-    """The rows of one set-up that say where the robot stands; None where no device measured positions.
+def registration_rows(data: Any, model: Any) -> Measurements | None:
+    """The rows of one set-up that say where the robot stands, with a hidden ball where a model has one.
 
-    Raises:
-        InputError: something else than rows. MeasurementError: rows of which a part says so.
+    None where no device measured positions. InputError for something else than rows.
     """
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
-    parts = rows_of_one_kind(data)
-    own = [sensor_of(part).set_up(part) for part, _ in parts]
-    if len(own) > 1 and any(rows is not None for rows in own):
-        fix = "recalibrate with them, which places every device; or pass the rows with measured positions alone "
-        fix += "(`data.device_rows()`), and the model will know their markers only"
-        got = ", ".join(part.kind for part, _ in parts)
-        raise MeasurementError.of("a registration", expected="rows of one kind", got=got, fix=fix)
-    return own[0]
+    own = [(sensor_of(part), sensor_of(part).set_up(part)) for part, _ in rows_of_one_kind(data)]
+    return next((sensor.with_points(rows, model) for sensor, rows in own if rows is not None), None)
 
 
 def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
@@ -176,7 +174,8 @@ def _starts(part: Known, widest: float) -> list[Place]:
     session, old, view, same = part
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
+    points = session.points[:, : session.points.shape[1] - session.ball]
+    shown = bool((~points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
     free = shown and session.frame_free and session.body_free
     if free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
         starts.append(anywhere(session, old))
@@ -278,7 +277,7 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         centre=R @ session.centre + mean.T[:3, 3],
         q=session.q,
         gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(widened * mean_block(session.noise, visible), R),
+        noise=turned(widened * _mean_noise(session, visible), R),
         free=free,
         outliers=outliers,
         rms_before=before,
@@ -288,6 +287,13 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
         undetermined=undetermined(covariance, mean.body.points, arm, usual, tips, rigid=rigid),
     )
+
+
+def _mean_noise(session: Session, visible: Tensor) -> Tensor:
+    """Covariance (m, m) of a new measurement, m^2: that of the fit for points that no row shows."""
+    found, unseen = mean_block(session.noise, visible), ~visible.any(0)
+    both = unseen[:, None] & unseen
+    return torch.where(both, session.fitted.new_noise, found) if bool(unseen.any()) else found
 
 
 def _rms(errors: Tensor) -> float:

@@ -37,8 +37,10 @@ class Known(NamedTuple):
         return self._replace(session=self.session.rows(keep), view=self.view.rows(keep))
 
 
-def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str) -> Known:
-    """The rows as the fitted map sees them, in its own frame.
+def session_of(
+    model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool = False
+) -> Known:
+    """The rows as the fitted map sees them, in its own frame; ``ball``: see :class:`Session`.
 
     Raises:
         InputError: the markers are to stay, but other ones were measured.
@@ -60,7 +62,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
     zero = data.points.new_zeros(size, size)
     rows = data.q, data.points, _noise(model.new_noise, data, None), zero[0, :3], zero
-    session = Session(fit, nominal, same, *rows, free != "marker", free != "base")
+    session = Session(fit, nominal, same, *rows, free != "marker", free != "base", ball)
     view = session.view(old)
     T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
     earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
