@@ -186,7 +186,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     """
     for table, _ in divided(data)[1]:
         devices = places.devices[sensor_key(table)]
-        away = devices.errors(table, model(table.q).detach()[:, -1]).norm(dim=1)
+        away = devices.errors(table, devices.points_of(model(table.q).detach())).norm(dim=1)
         if implausibly_far(model, float(away.median())):
             what, got = (
                 "these errors are not those of a calibrated robot",

@@ -150,7 +150,7 @@ class CalibrationResult:
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-        return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
+        return devices, devices.errors(data, devices.points_of(self.stages[stage](data.q).detach()))
 
     @property
     def left_out_rms(self) -> float:

@@ -24,6 +24,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
+from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import SESSION, SOCKET, PlacedDevices
 from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_sessions, placed, sensor_key
 
@@ -203,10 +204,13 @@ class Contacts(Sensor):
 
 
 class OtherDevices(Sensor):
-    """Readings of the ball by other devices."""
+    """Readings of the ball, or of a frame of the tool, by other devices."""
 
     def check(self, data: Readings, model: Any) -> None:
-        """They tell of the ball alone."""
+        """They tell of the ball alone, or of the frame of measured poses."""
+        if kind_of(data).seen_points > 1:
+            bodies_of(model.lever).pose_lever()
+            return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def with_points(self, data: Readings, model: Any) -> Readings:
@@ -221,7 +225,7 @@ class OtherDevices(Sensor):
         names = tuple(name for name in data.names if known is None or name not in known.names)
         new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
         rows = data.rows(new[data.device])
-        devices = placed(rows, beside.points(rows)[:, -1])
+        devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
         if known is not None:
             all_names, constants = (*known.names, *devices.names), torch.cat([known.constants, devices.constants])
@@ -238,7 +242,7 @@ class OtherDevices(Sensor):
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
         unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
-        away = per_unit * devices.in_unit(data, devices.errors(data, points[:, -1]))
+        away = per_unit * devices.in_unit(data, devices.errors(data, devices.points_of(points)))
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
@@ -247,13 +251,14 @@ class OtherDevices(Sensor):
 
     def settled(self, data: Readings, points: Tensor) -> tuple[PlacedDevices, ...]:
         """The devices, with the standard deviations of their increments."""
-        found = placed(data, points[:, -1])
-        rms = float(found.errors(data, points[:, -1]).norm(dim=1).square().mean().sqrt())
+        found = placed(data, points)
+        seen = found.points_of(points)
+        rms = float(found.errors(data, seen).norm(dim=1).square().mean().sqrt())
         if rms > LARGEST_RMS_M:
             fix = "recalibrate, which finds another ball; or check the rows"
             expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
             raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
-        deviations = found.open_deviations(data, points[:, -1])
+        deviations = found.open_deviations(data, seen)
         return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations),)
 
 

@@ -12,7 +12,7 @@ from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.sensors.devices import Devices, numbers_text
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import known_kinds
 
 SESSION, SOCKET = "session", "socket"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
@@ -61,9 +61,9 @@ class PlacedDevices:
     @property
     def devices(self) -> Devices | None:
         """As devices of readings; None for other kinds, and for those that nobody registered."""
-        if self.kind not in KINDS:
+        if self.kind not in known_kinds():
             return None
-        return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
+        return known_kinds()[self.kind](self.names, self.constants, self.deviations.amax(0))
 
     def sentences(self) -> list[str]:
         """Where each of them is in the frame of the model, with standard deviations."""

@@ -150,15 +150,22 @@ def sensor_key(data: Readings) -> object:
     return data.kind, data.offset_std, data.intrinsics
 
 
+def fitting_devices(data: Readings, points: Tensor) -> Devices:
+    """The devices where they fit readings best, for known points (N, P, 3) of the tool, m."""
+    kind = kind_of(data)
+    seen = kind.points_of(points)
+    return kind.at(data, seen).refined(data, seen)
+
+
 def placed(data: Readings, points: Tensor) -> Devices:
-    """The devices where they fit readings of known points (N, 3), m, best.
+    """The same for rows that a user passes.
 
     Raises:
         MeasurementError: too few rows of a device, or readings that no place of it explains.
     """
     check_devices(data)
     try:
-        return kind_of(data).at(data, points).refined(data, points)
+        return fitting_devices(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         fix = "check the columns of the readings, their unit, and which device each row names"
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None

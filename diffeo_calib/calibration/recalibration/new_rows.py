@@ -31,7 +31,7 @@ from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.regions import region_scale
 from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.places import fitting_devices
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
@@ -366,8 +366,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
 
 def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
     """The devices of readings around the points of the old model."""
-    ball = seen[rows, -3:]
-    devices = kind_of(table).at(table, ball).refined(table, ball)
+    devices = fitting_devices(table, seen[rows].unflatten(1, (-1, 3)))
     return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
 
 
