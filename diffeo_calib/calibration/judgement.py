@@ -24,7 +24,6 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
 )
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
@@ -73,10 +72,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
     NaN for hidden markers.
     """
-    bodies = bodies_of(data)
-    mean, covariance = bodies.predicted(model.at_payloads(data.payload))
-    errors = bodies.errors(mean)
-    solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
+    found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+    errors = data.bodies.errors(data, found.points)
+    solved = torch.linalg.solve(found.covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
 
 

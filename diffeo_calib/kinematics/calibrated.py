@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.re_registration.register_again import devices_besid
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     directions_of_frames,
@@ -34,7 +35,6 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.placed import PlacedDevices
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.body_kinds import BodyKind, body_kind
+from diffeo_calib.measurements.bodies import Bodies, bodies_of
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
@@ -301,9 +301,9 @@ class Measurements(ImageTable, SocketTable):
         return seen
 
     @property
-    def body_kind(self) -> BodyKind:
+    def bodies(self) -> Bodies:
         """What the rows show: markers, or frames."""
-        return body_kind(self.lever)
+        return bodies_of(self.lever)
 
     @property
     def origins(self) -> Tensor:
@@ -313,7 +313,16 @@ class Measurements(ImageTable, SocketTable):
     @property
     def seen_bodies(self) -> Tensor:
         """(N, P) or (N, T) boolean: which markers, or measured frames, were seen."""
-        return self.visible if self.lever is None else self.visible[:, ::POINTS]
+        return self.visible[:, :: self.bodies.points]
+
+    @property
+    def body_kinds(self) -> Tensor | None:
+        """(N, B) int64, 1 for the ball in sockets beside bodies that a device saw, 0; None if all are of one kind."""
+        if self.sockets is None or self.without_device:
+            return None
+        found = torch.zeros(self.seen_bodies.shape, dtype=torch.int64, device=self.q.device)
+        found[:, -1] = 1
+        return found
 
     @property
     def body_names(self) -> list[str]:

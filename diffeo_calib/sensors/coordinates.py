@@ -21,7 +21,6 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
@@ -90,7 +89,7 @@ class Positions(Sensor):
 
     def check(self, data: Measurements, model: Any) -> None:
         """The same kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
-        own, seen = bodies_of(model.lever), bodies_of(data.lever)
+        own, seen = model.bodies, data.bodies
         if own.kind != seen.kind:
             what = f"the model was calibrated with {own.kind}"
             raise InputError.of(what, expected=f"measured {own.kind}", got=seen.kind, fix=self.fix)
@@ -154,7 +153,7 @@ class Poses(Positions):
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
         measured = whole_frames(data)
-        frames = frames_of_points(points, bodies_of(data.lever).pose_lever())
+        frames = frames_of_points(points, data.bodies.pose_lever())
         away = measured[..., :3, 3] - frames[..., :3, 3]
         angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
         angles = angles[:, 0] if angles.shape[1] == 1 else angles
@@ -209,7 +208,7 @@ class OtherDevices(Sensor):
     def check(self, data: Readings, model: Any) -> None:
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
-            bodies_of(model.lever).pose_lever()
+            model.bodies.pose_lever()
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
@@ -284,7 +283,7 @@ def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
     Points whose tips are not named are those of the model, in its order.
     """
     if data.on is not None and data.on != own:
-        bodies = bodies_of(data.lever)
+        bodies = data.bodies
         what = f"the measurements' {bodies.many} are on other tips than the model's"
         expected, got = (listed(on[:: bodies.points]) for on in (own, data.on))
         raise MeasurementError.of(what, expected=expected, got=got, fix=f"put the {bodies.many} in its order")
@@ -297,7 +296,7 @@ def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
         MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
             say on which of them their markers are.
     """
-    bodies = bodies_of(data.lever)
+    bodies = data.bodies
     if data.on is not None and not set(data.on) <= set(robot.tips):
         what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {bodies.one}"
         got = listed(data.on[:: bodies.points])

@@ -21,7 +21,6 @@ from diffeo_calib.calibration.identification.robust_registration import (
 )
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -185,7 +184,7 @@ def warn_of_outliers(flagged: int, data: Measurements, reason: str) -> None:
 
 def _check_orientations(data: Measurements, identification: Identification) -> None:
     """Refuse poses whose orientations do not belong to the robot: a wrong convention or unit."""
-    angles = known(bodies_of(data).turns(identification.geometry.points(data.q)))
+    angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
     if len(angles) and float((angles > LIMITS.orientation_rad).double().mean()) > LIMITS.orientation_share:
         raise MeasurementError.of(
             "the measured orientations do not fit this robot, even with geometric errors",

@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.measurements.bodies import table_of_points
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 
 GEODESIC_ROWS = 80
@@ -183,7 +183,7 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
     """The map of a model, with device and markers where another model of the robot has them."""
     own = model.to(HOST)
-    virtual = table_of_points(q, other(q), other.lever).with_load(own.nominal.load)
+    virtual = Measurements.of_points(q, other(q), None, other.lever).with_load(own.nominal.load)
     fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)

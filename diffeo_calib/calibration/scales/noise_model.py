@@ -33,7 +33,7 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
-from diffeo_calib.measurements.bodies import bodies_of, seen_board
+from diffeo_calib.measurements.bodies import seen_board
 from diffeo_calib.measurements.pose_frames import block_diagonal, inverse_poses, own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
@@ -75,9 +75,9 @@ class NoiseModel:
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
-        seen = bodies_of(data)
-        own = seen.count, 3 * seen.points, data.covariance, seen.modes, SLACK_SHARE * residual
-        return cls(*own, visible=visible, kinds=seen.kinds)
+        size = data.bodies.points
+        own = data.markers // size, 3 * size, data.covariance, data.bodies.modes(data), SLACK_SHARE * residual
+        return cls(*own, visible=visible, kinds=data.body_kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""

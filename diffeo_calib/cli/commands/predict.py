@@ -18,7 +18,6 @@ from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, w
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import OutsideRange
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
@@ -56,7 +55,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     for line in provenance_lines(kinematics):
         say(line)
     table, joints = _written_as_read(kinematics, given)
-    robot, with_poses, bodies = kinematics.robot, kinematics.lever is not None, body_kind(kinematics.lever)
+    robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
@@ -67,7 +66,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = ((rows.q, *_with_deviations(*bodies.predicted(rows.carried_by(kinematics), rows.q))) for rows in laden)
+        blocks = ((rows.q, *_with_deviations(*rows.predicted(kinematics))) for rows in laden)
         write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
@@ -96,9 +95,10 @@ class _Rows:
     def __len__(self) -> int:
         return len(self.q)
 
-    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics:
-        """The model under the payloads of the rows."""
-        return model if self.masses is None else model.at_payloads(self.masses)
+    def predicted(self, model: CalibratedKinematics) -> tuple[Tensor, Tensor]:
+        """Markers, or poses, of a model under the payloads of the rows, with covariances."""
+        loaded = model if self.masses is None else model.at_payloads(self.masses)
+        return model.bodies.written(loaded, self.q)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

@@ -23,10 +23,10 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.sensors.bodies import Body
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
 from diffeo_calib.sensors.placed import PlacedDevices
 from diffeo_calib.sensors.tables import rows_of_one_kind

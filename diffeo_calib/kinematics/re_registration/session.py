@@ -15,10 +15,10 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.maps.noise import without_hidden
+from diffeo_calib.measurements.bodies import Body, bodies_of
 from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.sensors.bodies import Body, bodies_of
 
 LEAST_POINTS = 3
 """Points that determine where a frame is."""
@@ -46,7 +46,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     """
     before, fit = model.registration, model.unregistered
     markers = _markers(fit, nominal) if before is None else before.markers
-    own, seen = bodies_of(lever), bodies_of(data.lever)
+    own, seen = bodies_of(lever), data.bodies
     known = own.kind == seen.kind and data.markers == len(markers)
     if known:
         data, seen = own.represented(data), own
@@ -111,7 +111,7 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    each = bodies_of(data.lever).numbers * float(data.seen_bodies.sum()) / len(data)
+    each = data.bodies.numbers * float(data.seen_bodies.sum()) / len(data)
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:

@@ -114,4 +114,4 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
 
 def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
     """Predicted positions of the markers, or of the origins of measured poses: (N, B, 3) m."""
-    return data.body_kind.origins(at_payloads(kinematics, data)(data.q).detach())
+    return data.bodies.origins(at_payloads(kinematics, data)(data.q).detach())
