@@ -12,7 +12,7 @@ from simulated_camera import CORNERS, HEIGHT, SQUARE, WIDTH, true_camera
 from torch import Tensor
 
 from diffeo_calib.cameras.board import real_board
-from diffeo_calib.cameras.images import undistorted
+from diffeo_calib.cameras.images import Camera, undistorted
 
 SQUARES = CORNERS[0] + 1, CORNERS[1] + 1
 MARKER, DICTIONARY = 0.022, "DICT_5X5_100"
@@ -36,14 +36,22 @@ def texture(dictionary: str = DICTIONARY) -> np.ndarray:
     return board.generateImage(size, marginSize=MARGIN)
 
 
-def rendered(pose: Tensor, page: np.ndarray, *, blur_px: float = 0.6, noise: float = 2.0, seed: int = 0) -> np.ndarray:
+def rendered(
+    pose: Tensor,
+    page: np.ndarray,
+    *,
+    blur_px: float = 0.6,
+    noise: float = 2.0,
+    seed: int = 0,
+    camera: Camera | None = None,
+) -> np.ndarray:
     """A grey image of the board at a pose (4, 4) in the camera's frame, m.
 
     Args:
         pose: of the board's middle. page: see :func:`texture`. blur_px: standard deviation of the lens' blur, pixels.
-        noise: standard deviation of grey values, of 255. seed: of the noise.
+        noise: standard deviation of grey values, of 255. seed: of the noise. camera: with the print; the usual lens.
     """
-    camera, rays = true_camera(), _rays()
+    camera, rays = camera or true_camera(), _rays()
     # from the plane of the board as it was meant to that of the image: bends and scales are small, two rounds do
     R, t = pose[:3, :3].float(), pose[:3, 3].float()
     flat = torch.zeros_like(rays)

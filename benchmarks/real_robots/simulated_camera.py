@@ -33,17 +33,20 @@ LENS = 1200.0, 1195.0, 650.0, 470.0, -0.15, 0.08, 1e-3, -5e-4, 0.0
 """True lens of the camera, see diffeo_calib.cameras.lens."""
 PRINT = 1e-4, 1e-4, 1e-3, 0.0, -5e-4
 """True errors of the printed board, see diffeo_calib.cameras.board."""
+BOARD_PRIOR = BoardPrior(scale=2e-4)
+"""Of a print that was measured with a caliper."""
 FEWEST_SEEN = 12
 """Corners of an image that is used."""
 
 
 @dataclass(frozen=True)
 class CameraArm:
-    """An arm, configurations in which its camera sees the board, and the true poses of the board in the camera."""
+    """An arm, configurations in which its camera sees the board, true poses of the board in the camera, lens, print."""
 
     arm: SimulatedArm
     q: Tensor
     boards: Tensor
+    camera: Camera
 
     def measured(self, position_std: float, rotation_std: float, *, on_tool: bool = True) -> dc.Measurements:
         """Measured poses with drawn errors [m, rad]; not ``on_tool``: inverted by hand, as of any device."""
@@ -56,9 +59,9 @@ class CameraArm:
 
     def images(self, noise_px: float, *, on_tool: bool = True, seed: int = 7) -> dc.Measurements:
         """Corners with drawn errors in the images that show enough of them; not ``on_tool``: seen by a fixed camera."""
-        corners = seen_corners(self.boards, noise_px, seed)
+        corners = seen_corners(self.boards, noise_px, seed, self.camera)
         shown = (~corners[..., 3].isnan()).sum(1) >= FEWEST_SEEN
-        known = {"board": BoardPrior(scale=2e-4), "camera_on_tool": on_tool}
+        known = {"board": BOARD_PRIOR, "camera_on_tool": on_tool}
         names = self.arm.nominal.joint_names
         return dc.Measurements.from_images(self.q[shown], corners[shown], (WIDTH, HEIGHT), names, **known)
 
@@ -74,36 +77,40 @@ def flat_board() -> Tensor:
     return torch.stack([x.flatten(), y.flatten(), torch.zeros_like(x).flatten()], 1)
 
 
-def true_camera() -> Camera:
-    """Lens and board as they are."""
-    unknowns = torch.tensor([*LENS, *PRINT], dtype=torch.float64, device=HOST)
+def true_camera(print_seed: int | None = None) -> Camera:
+    """Lens and board as they are; with a seed the errors of the print are drawn from their prior."""
     half_size = SQUARE * (max(CORNERS) - 1) / 2
+    unknowns = torch.tensor([*LENS, *PRINT], dtype=torch.float64, device=HOST)
+    if print_seed is not None:
+        draw = torch.randn(len(PRINT), dtype=torch.float64, device=HOST, generator=seeded(print_seed))
+        unknowns[len(LENS) :] = draw * draw.new_tensor(BOARD_PRIOR.deviations(half_size))
     return Camera(WIDTH, HEIGHT, half_size, unknowns, unknowns.new_zeros(len(unknowns), 0))
 
 
-def seen_corners(boards: Tensor, noise_px: float, seed: int = 7) -> Tensor:
+def seen_corners(boards: Tensor, noise_px: float, seed: int = 7, camera: Camera | None = None) -> Tensor:
     """Corners (N, K, 5) of boards at poses (N, 4, 4) in the camera's frame, m and pixels, NaN outside of the image."""
     points = flat_board().expand(len(boards), -1, 3)
-    pixels = true_camera().pixels(boards, points)
+    pixels = (camera or true_camera()).pixels(boards, points)
     pixels = pixels + noise_px * torch.randn(pixels.shape, dtype=pixels.dtype, device=HOST, generator=seeded(seed))
     found = torch.cat([points, pixels], 2)
     outside = (pixels < 0).any(2) | (pixels[..., 0] > WIDTH - 1) | (pixels[..., 1] > HEIGHT - 1)
     return found.masked_fill(outside[..., None], torch.nan)
 
 
-def camera_arm(rows: int, seed: int = 1) -> CameraArm:
-    """An arm whose camera sees the board in random configurations."""
+def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) -> CameraArm:
+    """An arm whose camera sees the board in random configurations; the print as of :func:`true_camera`."""
     arm = SimulatedArm(seed=seed, markers=3)
     given = torch.tensor(CAMERA, dtype=torch.float64, device=HOST)
     camera = transforms(rotation(given[None, 3:]), given[None, :3])
     base = torch.eye(4, dtype=torch.float64, device=HOST)
     base[:3, 3] = -torch.tensor(BOARD, dtype=torch.float64, device=HOST)
     arm.truth = replace(arm.truth, base=base, tool=mark_points(camera, LEVER)[0])
-    return _seen(arm, rows, seed, lambda points: inverse_poses(poses_from_marks(points, LEVER)))
+    seen_boards = _seen(arm, rows, seed, lambda points: inverse_poses(poses_from_marks(points, LEVER)))
+    return CameraArm(arm, *seen_boards, true_camera(print_seed))
 
 
-def fixed_camera_arm(rows: int, seed: int = 1) -> CameraArm:
-    """An arm with the board on its flange, in random configurations in which a fixed camera sees it."""
+def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) -> CameraArm:
+    """An arm with the board on its flange, in random configurations in which a fixed camera sees it; print as there."""
     arm = SimulatedArm(seed=seed, markers=3)
     place, aim = (torch.tensor(xyz, dtype=torch.float64, device=HOST) for xyz in FIXED_CAMERA)
     z = (aim - place) / (aim - place).norm()
@@ -115,11 +122,12 @@ def fixed_camera_arm(rows: int, seed: int = 1) -> CameraArm:
     on_flange = torch.eye(4, dtype=torch.float64, device=HOST)
     on_flange[:3, 3] = torch.tensor(BOARD_ON_FLANGE, dtype=torch.float64, device=HOST)
     arm.truth = replace(arm.truth, base=base, tool=mark_points(on_flange[None], LEVER)[0])
-    return _seen(arm, rows, seed, lambda points: poses_from_marks(points, LEVER))
+    seen_boards = _seen(arm, rows, seed, lambda points: poses_from_marks(points, LEVER))
+    return CameraArm(arm, *seen_boards, true_camera(print_seed))
 
 
-def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor], Tensor]) -> CameraArm:
-    """Random configurations in which the camera sees the printed side of the board."""
+def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Random configurations in which the camera sees the printed side of the board, and poses of the board."""
     found: list[tuple[Tensor, Tensor]] = []
     for draw in range(200):
         q = arm.sample(20_000, seed=1000 * seed + draw)
@@ -132,4 +140,4 @@ def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor],
         if sum(len(part) for part, _ in found) >= rows:
             break
     q, boards = (torch.cat(parts)[:rows] for parts in zip(*found, strict=True))
-    return CameraArm(arm, q, boards)
+    return q, boards

@@ -34,7 +34,9 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
         head += [f"avg_reprojection_error: {camera.noise!r}", f"board_half_size: {camera.half_size!r}"]
         root = ROOT, len(UNKNOWNS), camera.root.flatten().tolist()
         own = [matrix, lens, (BOARD, 1, camera.board.tolist()), root]
-    return "\n".join([*head, *(line for name, rows, data in own for line in _matrix(name, rows, data, ros=ros)), ""])
+    return "\n".join(
+        [*head, *(line for name, rows, data in own for line in matrix_lines(name, rows, data, ros=ros)), ""]
+    )
 
 
 def write_camera(path: str | PathLike[str], camera: Camera, *, ros: bool = False) -> None:
@@ -70,7 +72,8 @@ def read_camera(path: str | PathLike[str]) -> Camera:
     return Camera(width, height, half, torch.cat([lens, _numbers(file, text, BOARD, 5)]), root, noise)
 
 
-def _matrix(name: str, rows: int, data: list[float], *, ros: bool) -> list[str]:
+def matrix_lines(name: str, rows: int, data: list[float], *, ros: bool = False) -> list[str]:
+    """A matrix in YAML, of OpenCV or of ROS, from its numbers row by row."""
     cols, numbers = len(data) // rows, ", ".join(repr(float(value)) for value in data)
     kind = [] if ros else ["   dt: d"]
     return [

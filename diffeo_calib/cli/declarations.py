@@ -219,7 +219,8 @@ def export_command(
     if (given.tool or given.frame) and not wanted & {"--c", "--torch", "--onnx"}:
         raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")
     header = {"--c (its header)": None if given.c is None else given.c.with_suffix(".h")}
-    check_outputs(outputs | header, {"MODEL": model} | ({} if given.robot is None else {"--robot": given.robot}))
+    files = {name: path for name, path in outputs.items() if name != "--camera"}
+    check_outputs(files | header, {"MODEL": model} | ({} if given.robot is None else {"--robot": given.robot}))
     from diffeo_calib.cli.commands import export  # noqa: PLC0415
 
     export.run(model, given)

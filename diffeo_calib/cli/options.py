@@ -357,6 +357,11 @@ class Export:
     c: Path | None = option("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
     torch: Path | None = option("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
     onnx: Path | None = option("The same for onnxruntime; needs the packages onnx and onnxscript.", "ONNX")
+    camera: Path | None = option(
+        "Write the camera of a model of images: intrinsics (OpenCV, ROS camera_info), hand-eye transform, URDF joint, "
+        "static transform; its place belongs to --urdf, --dh or --ur-kinematics if these are written too.",
+        "FOLDER",
+    )
     tool: str | None = option(
         "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, "
         "and a rotation vector if it is turned. By default the tip itself, or the tool that the model was saved "
@@ -379,7 +384,7 @@ class Export:
         """Option -> file to write, None where it is not wanted."""
         rigid = {"--urdf": self.urdf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
         tables = {"--joint-offsets": self.joint_offsets, "--correction-tables": self.correction_tables}
-        return rigid | tables | {"--c": self.c, "--torch": self.torch, "--onnx": self.onnx}
+        return rigid | tables | {"--c": self.c, "--torch": self.torch, "--onnx": self.onnx, "--camera": self.camera}
 
 
 @dataclass(frozen=True, kw_only=True)

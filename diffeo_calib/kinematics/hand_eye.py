@@ -1,13 +1,15 @@
-"""Where a camera is on the tool, and where the board stands that it sees, with standard deviations.
+"""Where a camera and the board that it sees are, one of them on the tool, with standard deviations.
 
-A calibration finds the robot's base in the frame of the board, and the three points of the camera's pose in the frame
-of the tip. The first is the inverse of the board's pose in the base, the second the hand-eye transform.
+A calibration finds the robot's base in the frame of what stands, and the three points of a pose in the frame of the
+tip. A camera on the tool: the first is the inverse of the board's pose in the base, the second the hand-eye transform.
+A fixed camera: the inverse of the camera's pose in the base, and the board on the tool.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +19,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 
 
@@ -49,23 +52,31 @@ class KnownPose:
         yield f"  known to {_numbers(1e3 * position)} mm and {_numbers(rotation.rad2deg())} deg (standard deviations)"
 
 
+class Fixed(NamedTuple):
+    """A pose in the frame of a link, and what messages and files call this frame."""
+
+    known: KnownPose
+    link: str
+    where: str
+    key: str
+
+
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """A camera on a robot and its board.
+    """A camera and its board: one of them is fixed to the robot's tip, the other stands."""
 
-    Args:
-        tip: name of the robot's tip.
-        camera: the camera in the frame of the tip: the hand-eye transform.
-        board: the board in the robot's base.
-    """
-
-    tip: str
-    camera: KnownPose
-    board: KnownPose
+    camera: Fixed
+    board: Fixed
 
     @classmethod
-    def of(cls, model: CalibratedKinematics) -> HandEye:
-        """Camera and board of a model that was calibrated with a camera on the tool.
+    def of(
+        cls, model: CalibratedKinematics, *, camera_on_tool: bool = True, geometry: Geometry | None = None
+    ) -> HandEye:
+        """Camera and board of a model that was calibrated with images or poses of a board.
+
+        Args:
+            model: the model. camera_on_tool: whether the camera is on the tool, else the board.
+            geometry: rigid kinematics, with the places that belong to them; by default those of the model.
 
         Raises:
             InputError: a model of points, or one that was registered again.
@@ -73,25 +84,28 @@ class HandEye:
         fitted, lever = model.map, model.bodies.pose_lever()
         if model.registration is not None:
             raise InputError.of("the hand-eye transform", expected="a model in the place of its fit")
-        geometry = model.geometry
-        camera = poses_from_marks(geometry.tool[None], lever)
-        to_pose = pose_directions(camera, lever)[0]  # (6, 9)
+        geometry = geometry or model.geometry
+        carried = poses_from_marks(geometry.tool[None], lever)
+        to_pose = pose_directions(carried, lever)[0]  # (6, 9)
         known = to_pose @ _covariance(fitted, geometry.slices["tool"]) @ to_pose.mT
-        board = inverse_poses(geometry.base[None])[0]
-        # base T(e) for an error twist e: the board moves by -e, at its place, seen from the base
-        moved = -torch.eye(6, dtype=board.dtype, device=board.device)
-        moved[:3, 3:] = skew(board[:3, 3])
+        standing = inverse_poses(geometry.base[None])[0]
+        # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
+        moved = -torch.eye(6, dtype=standing.dtype, device=standing.device)
+        moved[:3, 3:] = skew(standing[:3, 3])
         found = moved @ _covariance(fitted, geometry.slices["base"]) @ moved.mT
-        return cls(geometry.on[0], KnownPose(camera[0], known), KnownPose(board, found))
+        tip, base = geometry.on[0], model.robot.base
+        carried_there = Fixed(KnownPose(carried[0], known), tip, f"in the frame of '{tip}'", "in_tip")
+        standing_there = Fixed(KnownPose(standing, found), base, "in the robot's base", "in_base")
+        return cls(*((carried_there, standing_there) if camera_on_tool else (standing_there, carried_there)))
 
     def entry(self) -> dict[str, object]:
         """Both poses for programs."""
-        return {"camera_in_tip": self.camera.entry(), "board_in_base": self.board.entry()}
+        return {f"{name}_{own.key}": own.known.entry() for name, own in vars(self).items()}
 
     def sentences(self) -> Iterator[str]:
         """Both poses with their deviations."""
-        yield from self.camera.sentences(f"camera in the frame of '{self.tip}' (hand-eye transform)")
-        yield from self.board.sentences("board in the robot's base")
+        yield from self.camera.known.sentences(f"camera {self.camera.where} (hand-eye transform)")
+        yield from self.board.known.sentences(f"board {self.board.where}")
 
 
 def _covariance(fitted: FittedMap, part: slice) -> Tensor:

@@ -100,10 +100,17 @@ class ImageTable(RowTable):
         """See :meth:`Measurements.from_poses`."""
         raise NotImplementedError
 
-    def shared_errors(self) -> Iterator[tuple[Camera, Tensor]]:
-        """The camera, and effects (N, 9, c) of its errors of unit variance on the points of poses, m; for images."""
-        if self.camera is not None and self.pose_shared is not None:
-            yield self.camera, self._pose_slopes() @ self.pose_shared
+    @property
+    def sees_board_from_tool(self) -> bool | None:
+        """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board."""
+        return True if self.board is not None else False if self.camera is not None else None
+
+    def shared_errors(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:
+        """For images: the camera; effects (N, 9, c) of its errors of unit variance on the points of poses, m; and the
+        covariance (N, 9, 9) of the points by the noise of each image, m^2."""
+        if self.camera is not None and self.pose_shared is not None and self.pose_covariance is not None:
+            slopes = self._pose_slopes()
+            yield self.camera, slopes @ self.pose_shared, slopes @ self.pose_covariance @ slopes.mT
 
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""

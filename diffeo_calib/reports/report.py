@@ -15,6 +15,7 @@ from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import placement_sentences
 from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find, refuse_columns
 from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
@@ -102,7 +103,11 @@ def page(found: Findings, title: str, data_sha256: str | None, progress: Progres
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),
         figures=dict(_figures(found)),
-        sections=[*made, sections.record(found.model, shown_sha256)],
+        sections=[
+            *made,
+            *kinds.devices(placement_sentences(found.model)),
+            sections.record(found.model, shown_sha256),
+        ],
     )
 
 

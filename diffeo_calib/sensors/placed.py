@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -65,8 +66,15 @@ class PlacedDevices:
             return None
         return known_kinds()[self.kind](self.names, self.constants, self.deviations.amax(0))
 
+    @property
+    def camera(self) -> BoardCamera | None:
+        """As the camera that saw a board; None for other kinds."""
+        return BoardCamera.of(self.constants[0]) if self.kind == CAMERA else None
+
     def sentences(self) -> list[str]:
-        """Where each of them is in the frame of the model, with standard deviations."""
+        """Where each of them is in the frame of the model, with standard deviations; lens and board of a camera."""
+        if self.kind == CAMERA:
+            return [] if self.camera is None else list(self.camera.sentences())
         devices = self.devices
         if devices is not None:
             return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]

@@ -64,10 +64,9 @@ def test_pixels_are_better_than_poses() -> None:
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    placed = calibrated().placement.placed()[0]
-    truth = true_camera().unknowns
-    deviations = placed.deviations[0]
-    assert float(((placed.constants[0, -len(truth) :] - truth) / deviations).abs().max()) < 4.5
+    camera = calibrated().model.placement[0].camera.camera
+    truth, deviations = true_camera().unknowns, camera.deviations
+    assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
     assert before is not None
     assert bool((deviations <= 1.001 * before.deviations).all())  # rows of the robot can only add

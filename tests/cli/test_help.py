@@ -42,7 +42,7 @@ OPTIONS = {
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame", "--payload", "--tip"),
+        *("--c", "--torch", "--onnx", "--camera", "--tool", "--tool-from", "--frame", "--payload", "--tip"),
     ],
     "plan": [
         *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),

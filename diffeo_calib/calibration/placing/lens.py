@@ -11,14 +11,17 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.cameras.images import Camera
+from diffeo_calib.cameras.lens import LENS
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained
 from diffeo_calib.sensors.placed import PlacedDevices
 
-CAMERA = "camera"
 SIZE_WARNED, SIZE_REFUSED = 0.006, 0.02
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
 ROUNDS = 5
+PARTS = slice(0, len(LENS)), slice(len(LENS), None)
+"""Lens and board among the unknowns of a camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +30,17 @@ class LensAndBoard(DeviceSet):
 
     Args:
         camera: as images alone show them. slopes: (M, 9, c) effects of its errors on the points of each pose, m.
-        rows: (M,) their rows of a calibration.
+        rows: (M,) their rows of a calibration. on_tool: whether the camera is on the tool, else the board.
+        apart: (9 M, c) the same effects apart from the places of the robot and of what is on the tool.
+        explained: at the tool; what the fit says is zero before it.
     """
 
     camera: Camera
     slopes: Tensor
     rows: Tensor
+    on_tool: bool
+    apart: Tensor
+    explained: Explained
 
     @classmethod
     def of_table(cls, data: Measurements, rows: Tensor, registration: Identification) -> list[Any]:
@@ -41,9 +49,15 @@ class LensAndBoard(DeviceSet):
         Raises:
             MeasurementError: a board of another size than was said.
         """
-        found = [cls(camera, slopes, rows) for camera, slopes in data.shared_errors()]
-        for camera in found:
-            camera.check_size(data, registration)
+        found = []
+        for camera, slopes, noise in data.shared_errors():
+            corners = _rms_distance(noise.diagonal(dim1=1, dim2=2).sqrt())
+            explained = Explained(registration.rms, 0.0, 0.0, 0.0, 0.0, corners)
+            places = _places(data, registration).flatten(1, 2).flatten(0, 1)
+            apart = slopes.flatten(0, 1)
+            apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
+            found.append(cls(camera, slopes, rows, data.board is not None, apart, explained))
+            found[-1].check_size(data, registration)
         return found
 
     def check_size(self, data: Measurements, registration: Identification) -> None:
@@ -76,22 +90,37 @@ class LensAndBoard(DeviceSet):
     def settled(self, found: Settled) -> LensAndBoard:
         """See :class:`DeviceSet`."""
         root = self.camera.root @ torch.linalg.cholesky(found.covariance)
-        unknowns = self.camera.unknowns + self.camera.root @ found.shifts
-        return replace(self, camera=replace(self.camera, unknowns=unknowns, root=root))
+        change = self.camera.root @ found.shifts
+        lens, board = (self._at_tool(change, part) for part in PARTS)
+        lens_std, board_std = (self._at_tool(root, part) for part in PARTS)
+        known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
+        camera = replace(self.camera, unknowns=self.camera.unknowns + change, root=root)
+        return replace(self, camera=camera, explained=replace(self.explained, **known))
+
+    def _at_tool(self, errors: Tensor, part: slice) -> float:
+        """RMS distance, m, of points by some of the lens' and board's errors (14,) or (14, c), summed in squares."""
+        own = torch.zeros_like(errors)
+        own[part] = errors[part]
+        moved = self.apart @ torch.linalg.pinv(self.camera.root) @ own
+        return _rms_distance(moved.view(len(self.rows), self.slopes.shape[1], -1).norm(dim=2))
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""
         whole = torch.zeros_like(self.rows)
-        own = self.camera.unknowns[None], self.camera.deviations[None]
+        own = self._board_camera.numbers[None], self.camera.deviations[None]
         return PlacedDevices(CAMERA, (CAMERA,), *own, self.rows, whole)
+
+    @property
+    def _board_camera(self) -> BoardCamera:
+        return BoardCamera(self.camera, self.on_tool, self.explained)
 
     def sentences(self) -> list[str]:
         """See :class:`DeviceSet`."""
-        return list(self.camera.sentences())
+        return list(self._board_camera.sentences())
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
-        return {"camera": self.camera.entry()}
+        return {"camera": self.camera.entry() | {"explained_m": vars(self.explained) | {"arm": self.explained.arm}}}
 
 
 def relative_size(data: Measurements, registration: Identification) -> float:
@@ -100,9 +129,7 @@ def relative_size(data: Measurements, registration: Identification) -> float:
     Errors of base, markers and scale that explain the residuals of the registration, by reweighted least squares.
     """
     geometry = registration.geometry
-    parts = [geometry.slices[name] for name in ("base", "tool")]
-    by_place = geometry.sensitivities(data.q).flatten(1, 2)
-    slopes = torch.cat([*(by_place[..., part] for part in parts), data.by_board_size()], 2)
+    slopes = torch.cat([_places(data, registration).flatten(1, 2), data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     found = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):
@@ -111,3 +138,15 @@ def relative_size(data: Measurements, registration: Identification) -> float:
         size = (errors - slopes @ found).norm(dim=1)
         weights = (1 / (1 + (size / (3 * size.median().clamp(min=1e-9))) ** 2).sqrt())[:, None, None]
     return float(found[-1])
+
+
+def _places(data: Measurements, registration: Identification) -> Tensor:
+    """Derivatives (M, P, 3, 6 + 3 P) of points by the places of the base and of what is on the tool."""
+    geometry = registration.geometry
+    slopes = geometry.sensitivities(data.q)
+    return torch.cat([slopes[..., geometry.slices[name]] for name in ("base", "tool")], 3)
+
+
+def _rms_distance(coordinates: Tensor) -> float:
+    """RMS distance of points by RMS errors (M, 9) of their coordinates, m."""
+    return float((3 * coordinates.square().mean()).sqrt())

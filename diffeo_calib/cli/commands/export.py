@@ -14,10 +14,12 @@ from diffeo_calib.calibration.expected_errors import expected_of, stands_free
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.options import Export
+from diffeo_calib.cli.places import make_folder
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
+from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import angles, lengths, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
@@ -103,6 +105,7 @@ class _Export:
 
     Attributes:
         files: option -> content. rows: what the printed table compares. lines: sentences below it.
+        geometry: the rigid kinematics that are written; None for none.
     """
 
     def __init__(self, model: CalibratedKinematics, given: Export) -> None:
@@ -111,11 +114,13 @@ class _Export:
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
         self.lines: list[str] = []
+        self.geometry: Geometry | None = None
 
     def rigid(self, options: list[str], *, with_tables: bool, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
         urdf = None if options == ["--dh"] else urdf_of(self.model.robot, self.given.robot)
         found = rigid_kinematics(self.model, transmission=with_tables)
+        self.geometry = found.geometry
         together = " and --correction-tables"
         if with_tables:
             self.rows[", ".join(options) + together] = found
@@ -160,6 +165,14 @@ class _Export:
             "joint offsets: reading + offset is the joint value for nominal kinematics; they hold no other error"
         )
 
+    def camera(self, folder: Path) -> dict[Path, bytes]:
+        """The files of the camera; its place belongs to the rigid kinematics, if any are written."""
+        files = camera_files(self.model, self.geometry)
+        make_folder(folder)
+        belongs = "the calibrated model" if self.geometry is None else "the rigid kinematics written beside it"
+        self.lines.append(f"camera: {', '.join(files)} in {folder}; its place belongs to {belongs}")
+        return {folder / name: text.encode() for name, text in files.items()}
+
     def tables(self) -> None:
         """Correction tables, with the nominal robot."""
         tables = correction_tables(self.model)
@@ -189,7 +202,8 @@ def run(path: Path, given: Export) -> None:
     if tables:
         export.tables()
     programs = Programs(export.model, wanted, tool, given.tip)
-    write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts)
+    camera = export.camera(wanted["--camera"]) if "--camera" in wanted else {}
+    write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts | camera)
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)

@@ -96,7 +96,7 @@ def run(
         watched = interrupts.watching(progress, err.print)
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
         result = replace(result, model=made_by_command(result.model))
-    hand_eye = HandEye.of(result.model) if placed_camera(result) else None
+    hand_eye = hand_eye_of(result)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**({} if hand_eye is None else {"hand_eye": hand_eye.entry()}))
@@ -120,10 +120,11 @@ def run(
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def placed_camera(result: CalibrationResult) -> bool:
-    """Whether the rows are poses of a board that a camera on the tool saw."""
+def hand_eye_of(result: CalibrationResult) -> HandEye | None:
+    """Camera and board; None if no camera is known to have measured the rows."""
     own = result.placed.coordinates
-    return own is not None and own.table.board is not None
+    on_tool = None if own is None else own.table.sees_board_from_tool
+    return None if on_tool is None else HandEye.of(result.model, camera_on_tool=on_tool)
 
 
 def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:

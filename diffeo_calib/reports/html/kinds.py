@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.analysis.kinds import KindFindings
@@ -70,15 +70,20 @@ def sections(found: KindFindings) -> Iterator[Section]:
     """What the page shows before its record."""
     yield _how_good(found)
     yield _expected(found)
-    if found.devices:
-        see = (
-            "Where devices and sockets stand, and what was found from the rows shown because the model did not know it."
-        )
-        yield Section("devices", "Devices", see, text=[printable(line) for line in found.devices])
+    yield from devices(found.devices)
     longest = max(len(short(part.name)) for part in found.parts)
     frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=0.3 + PER_LETTER * longest)
     picture = panel("parts", "What each part explains (parts may cancel).", draw_parts, found.parts, frame=frame)
     yield Section("why", "Why", "What each part of the model explains.", pictures=[picture], notes=[NO_POSITIONS])
+
+
+def devices(lines: Sequence[str]) -> Iterator[Section]:
+    """Where devices are, if there is anything to say."""
+    if lines:
+        see = (
+            "Where devices and sockets stand, and what was found from the rows shown because the model did not know it."
+        )
+        yield Section("devices", "Devices", see, text=[printable(line) for line in lines])
 
 
 def _how_good(found: KindFindings) -> Section:

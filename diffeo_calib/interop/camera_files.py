@@ -1,0 +1,81 @@
+"""The camera of a model in files of other programs: intrinsics, hand-eye transform, URDF joint, static transform."""
+
+from __future__ import annotations
+
+from xml.sax.saxutils import quoteattr
+
+from diffeo_calib.cameras.files import camera_text, matrix_lines
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop.files import origin_numbers
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.geometry import Geometry
+
+FRAME = "camera_optical_frame"
+"""The camera's frame: x right, y down, z ahead (REP 103)."""
+
+
+def camera_files(model: CalibratedKinematics, geometry: Geometry | None = None) -> dict[str, str]:
+    """Names and contents of the files.
+
+    Args:
+        model: of images of a board. geometry: rigid kinematics that the camera's place belongs to; the model's own by
+            default.
+
+    Raises:
+        InputError: a model without such a camera, or one that was registered again.
+    """
+    found = next((own.camera for own in model.placement if own.camera is not None), None)
+    if found is None:
+        fix = "calibrate with a table of `images`; poses of a board tell no lens, `fit --json` has their hand-eye"
+        raise InputError.of("the camera of the model", expected="one that saw a board in images", got="none", fix=fix)
+    own = HandEye.of(model, camera_on_tool=found.on_tool, geometry=geometry)
+    return {
+        "camera.yaml": camera_text(found.camera),
+        "camera_info.yaml": camera_text(found.camera, ros=True),
+        "hand_eye.yaml": _hand_eye(own),
+        "camera.xacro": _joint(own),
+        "static_transform.launch.xml": _launch(own),
+    }
+
+
+def _hand_eye(own: HandEye) -> str:
+    """Camera and board as OpenCV's `FileStorage` reads them: R, t as of `calibrateHandEye`."""
+    lines = ["%YAML:1.0", "---", f'camera_parent: "{own.camera.link}"']
+    for name, fixed in vars(own).items():
+        for part, rows, values in (
+            ("R", 3, fixed.known.pose[:3, :3]),
+            ("t", 3, fixed.known.pose[:3, 3]),
+            ("covariance", 6, fixed.known.covariance),  # of shift, m, and turn, rad
+        ):
+            lines += matrix_lines(f"{name}_{part}", rows, values.flatten().tolist())
+    return "\n".join([*lines, ""])
+
+
+def _joint(own: HandEye) -> str:
+    """A link and a fixed joint, to include in a xacro file of the robot."""
+    xyz, rpy = (" ".join(f"{value!r}" for value in part) for part in origin_numbers(own.camera.known.pose))
+    return f"""<?xml version="1.0"?>
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <link name="{FRAME}"/>
+  <joint name="camera_joint" type="fixed">
+    <parent link={quoteattr(own.camera.link)}/>
+    <child link="{FRAME}"/>
+    <origin xyz="{xyz}" rpy="{rpy}"/>
+  </joint>
+</robot>
+"""
+
+
+def _launch(own: HandEye) -> str:
+    """A launch file of ROS 2 that publishes the camera's frame."""
+    turn = rotation_numbers(own.camera.known.pose[None, :3, :3], "quat_xyzw")[0].tolist()
+    numbers = [*own.camera.known.pose[:3, 3].tolist(), *turn]
+    named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)
+    words = [*(f"--{name} {value!r}" for name, value in named), f"--frame-id {own.camera.link}"]
+    arguments = quoteattr(" ".join([*words, f"--child-frame-id {FRAME}"]))
+    return f"""<launch>
+  <node pkg="tf2_ros" exec="static_transform_publisher" name="camera_transform" args={arguments}/>
+</launch>
+"""

@@ -1,0 +1,80 @@
+"""The camera that saw a printed board, as a model keeps it: lens, print, and what they explain at the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.cameras.images import UNKNOWNS, Camera
+
+CAMERA = "camera"
+SIZE = len(UNKNOWNS)
+
+
+@dataclass(frozen=True)
+class Explained:
+    """RMS distances of the points of measured poses, m, apart from the places of the robot and of what is on the tool.
+
+    Args:
+        nominal: of the nominal robot from the images.
+        lens, board: how the fit with the robot changed what the images alone say.
+        lens_std, board_std: what is still not known of them.
+        corners: noise of one image.
+    """
+
+    nominal: float
+    lens: float
+    board: float
+    lens_std: float
+    board_std: float
+    corners: float
+
+    @property
+    def arm(self) -> float:
+        """What the arm's own errors explain."""
+        return max(self.nominal**2 - self.lens**2 - self.board**2 - self.corners**2, 0.0) ** 0.5
+
+    def sentence(self) -> str:
+        """In mm."""
+        own = {name: f"{1e3 * value:.3f}" for name, value in (vars(self) | {"arm": self.arm}).items()}
+        return (
+            f"arm or camera? the nominal arm misses the images by {own['nominal']} mm RMS at the tool: "
+            f"arm {own['arm']}, lens {own['lens']} (still unknown {own['lens_std']}), board {own['board']} "
+            f"(still unknown {own['board_std']}), corners of one image {own['corners']}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoardCamera:
+    """A camera, whether it is on the tool (else the board is), and what it explains."""
+
+    camera: Camera
+    on_tool: bool
+    explained: Explained
+
+    @property
+    def numbers(self) -> Tensor:
+        """All of it as the constants of a device."""
+        camera, unknowns = self.camera, self.camera.unknowns
+        own = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
+        root = unknowns.new_zeros(SIZE, SIZE)
+        root[:, : camera.root.shape[1]] = camera.root
+        return torch.cat([unknowns.new_tensor([*own, *astuple(self.explained)]), root.flatten(), unknowns])
+
+    @classmethod
+    def of(cls, numbers: Tensor) -> BoardCamera | None:
+        """The inverse of :attr:`numbers`; None for models of earlier versions, which keep lens and board alone."""
+        if len(numbers) <= SIZE:
+            return None
+        own, root, unknowns = numbers.split([len(numbers) - SIZE * (SIZE + 1), SIZE * SIZE, SIZE])
+        on_tool, width, height, half_size, noise, *explained = own.tolist()
+        camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise)
+        return cls(camera, bool(on_tool), Explained(*explained))
+
+    def sentences(self) -> Iterator[str]:
+        """Lens, board, and what explains what."""
+        yield from self.camera.sentences()
+        yield self.explained.sentence()
