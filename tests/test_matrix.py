@@ -437,8 +437,6 @@ NOT_YET: dict[tuple[str, str], str] = {
     **{("registered", kind): "refused" for kind in ("mixture", "several kinds", *OWN)},
     **{("evaluate --register", kind): "refused" for kind in ("mixture", "several kinds", *OWN)},
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read
-    **{("compare with a table", kind): "refused" for kind in ("images",)},
-    **{("recalibrate", kind): "refused" for kind in ("images",)},
     **{("init", kind): "refused" for kind in ("images", "images of a board", "several kinds", *OWN)},
 }
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
