@@ -28,8 +28,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.placement import PLACES, rigid_fit
 
 
 def workspace_deviation(fitted: FittedMap) -> float:

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.hidden_values import known, largest_known
-from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.common.quantiles import chi2_above, known, largest_known
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap

@@ -13,8 +13,7 @@ from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Ste
 from diffeo_calib.calibration.expected_errors import expected_of
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
-from diffeo_calib.common.quantiles import chi2_above, chi2_median
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     expected_covariance,

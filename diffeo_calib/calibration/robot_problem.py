@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.calibration.scales.differing_noise import new_noise
+from diffeo_calib.calibration.scales.cross_validation import new_noise
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.problem import Problem

@@ -24,8 +24,17 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.placed import SESSION, SOCKET, PlacedDevices
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_sessions, placed, sensor_key
+from diffeo_calib.sensors.places import (
+    BALL_IS_THE_MARKER,
+    ROWS,
+    SESSION,
+    SOCKET,
+    PlacedDevices,
+    Places,
+    place_sessions,
+    placed,
+    sensor_key,
+)
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.maps.observation import LinearFunctionals
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
     Devices,
     across,

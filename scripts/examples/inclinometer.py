@@ -13,7 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.poses import poses_of_triangles
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
 from diffeo_calib.sensors.kinds import register

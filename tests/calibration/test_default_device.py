@@ -23,9 +23,9 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
 from diffeo_calib.calibration.diagnostics.moved_devices import find_change_point
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
 from diffeo_calib.calibration.identification.identification import Prior, identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.identification.robust_registration import (
+from diffeo_calib.calibration.identification.registration import (
     find_joint_offsets,
+    register,
     register_robustly,
     with_joint_offsets,
 )

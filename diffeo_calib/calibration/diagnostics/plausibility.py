@@ -11,8 +11,8 @@ import torch
 from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
-from diffeo_calib.calibration.identification.robust_registration import (
+from diffeo_calib.calibration.identification.registration import (
+    ROBUST,
     distances,
     largest_distances,
     register_inliers,
@@ -20,7 +20,7 @@ from diffeo_calib.calibration.identification.robust_registration import (
     with_large_offsets,
 )
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -249,7 +249,7 @@ def _check_registration(robot: Tree, data: Measurements, registration: Identific
 def _check_gross_outliers(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements with many gross outliers that are far off."""
     largest = largest_distances(registration.geometry, data)
-    limit = REGISTRATION_LIMITS.gross_distances * float(largest.median())
+    limit = ROBUST.gross_distances * float(largest.median())
     gross = largest > limit
     if float(gross.double().mean()) <= LIMITS.gross_share:
         return

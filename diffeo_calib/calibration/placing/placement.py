@@ -24,7 +24,7 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 
 S = TypeVar("S", bound="DeviceSet")
 T = TypeVar("T")

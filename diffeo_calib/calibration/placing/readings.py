@@ -36,8 +36,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.placed import PlacedDevices
-from diffeo_calib.sensors.places import fitting_devices
+from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
 from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3

@@ -48,7 +48,7 @@ from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_
 from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import device_coordinates

@@ -25,9 +25,8 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 

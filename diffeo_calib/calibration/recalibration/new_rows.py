@@ -30,7 +30,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.regions import region_scale
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.places import fitting_devices
 
 ROUNDS = 20

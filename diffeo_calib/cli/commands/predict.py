@@ -9,8 +9,7 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.interrupts import Progress
+from diffeo_calib.cli.console import Progress, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.table import Measurements

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.robust_registration import register_robustly
+from diffeo_calib.calibration.identification.registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics

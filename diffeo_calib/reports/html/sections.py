@@ -9,9 +9,8 @@ import torch
 
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
-from diffeo_calib.kinematics.model_views import measured_words
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines

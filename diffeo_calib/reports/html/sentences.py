@@ -8,7 +8,7 @@ import torch
 
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
-from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
