@@ -5,7 +5,7 @@
 landmarks.py describes the tasks and the problem. Backends of the package: dense, tiled, keops, and
 keops_default_flags (the same formulas with pykeops' own compiler flags and summation scheme); tiled_rk4 is tiled
 with RK4 as time stepping (all other rows use RK8), tiled_unpooled is tiled with new matrices for every tile. Peers:
-peers.py (naive_dense, dense_autograd, keops_tutorial, keops_tuned) and peers_jax.py (diffrax).
+peers.py (naive_dense, dense_autograd, keops_tutorial, keops_tuned), peers_jax.py (diffrax) and peers_c.py (c).
 
 Every case runs in its own process (worker.py; with --quick there is one process per backend); the processes of one
 task and size are timed in turn. On a busy machine use --threads 1: two threads wait for each other. In
@@ -50,7 +50,7 @@ from worker import METHODS, Case, Goal, Worker, WorkerError
 from diffeo_calib.kernels.reductions import backends
 
 OURS = ("dense", "fused", "tiled", "keops", "keops_default_flags", "tiled_rk4", "tiled_unpooled")
-PEERS = ("naive_dense", "dense_autograd", "keops_tutorial", "keops_tuned", "diffrax")
+PEERS = ("naive_dense", "dense_autograd", "keops_tutorial", "keops_tuned", "diffrax", "c")
 SIZES = {"cpu": (256, 1024, 4096, 16384), "cuda": (1024, 4096, 16384, 100_000, 1_000_000)}
 DIMS = (2, 3, 6)
 STEPS, REFERENCE_STEPS, CHEAPER_REFERENCE_STEPS, CHEAP_POINTS = 5, 6, 3, 1024

@@ -3,8 +3,9 @@
     python benchmarks/kernel_sums/limits.py --threads 1 --out limits.json
 
 A sum over N points needs an exponential for each of N (N + 1) / 2 pairs, since the kernel is symmetric: with the
-processor's rate of exponentials, and nothing else to do, that is the limit. Tiles stay in the cache; memory bandwidth
-is the limit of methods that store the N x N matrix, which pass through it three times. Rates and sums take turns; all
+processor's rate of exponentials, and nothing else to do, that is the limit. Fused loops compute their own exponential,
+a polynomial, and may pass it. Tiles stay in the cache; memory bandwidth is the limit of methods that store the N x N
+matrix, which pass through it three times. Rates and sums take turns; all
 times are those of the processor's cores, so that other processes count less.
 
 Fields of a record:
@@ -31,11 +32,12 @@ import harness
 import torch
 from harness import Record
 from landmarks import landmarks
-from ours import Tiled
+from ours import Fused, Tiled
 
 SIZES, QUICK_SIZES, DIM = (1024, 4096, 16384), (1024,), 3
 IN_CACHE, IN_MEMORY, CALLS = 1 << 16, 1 << 24, 50
 TASKS = ("sum", "rhs", "adjoint")
+METHODS = {"fused": Fused, "tiled": Tiled}
 
 
 def cpu_seconds(call: Callable[[], object], calls: int = 1) -> float:
@@ -57,11 +59,11 @@ def rates() -> dict[str, Callable[[], float]]:
     }
 
 
-def measure(quick: bool, repeats: int) -> Iterator[Record]:
+def measure(backend: str, quick: bool, repeats: int) -> Iterator[Record]:
     """One record for each task and size."""
     threads, meters = torch.get_num_threads(), rates()
     for n in QUICK_SIZES if quick else SIZES:
-        method = Tiled(landmarks(n, DIM))
+        method = METHODS[backend](landmarks(n, DIM))
         for task in TASKS:
             call = method.function(task, 1)
             call()
@@ -76,7 +78,7 @@ def measure(quick: bool, repeats: int) -> Iterator[Record]:
             limit = 0.5 * n * (n + 1) / medians["exponentials_per_second"]
             stored = 3 * 8 * n * n / medians["bytes_per_second"]
             yield (
-                {"task": task, "n": n, "threads": threads, "repeats": repeats}
+                {"backend": backend, "task": task, "n": n, "threads": threads, "repeats": repeats}
                 | medians
                 | {
                     "pairs_per_second": n * n / medians["seconds"],
@@ -91,9 +93,10 @@ def program() -> None:
     arguments = harness.parser(__doc__)
     arguments.add_argument("--repeats", type=harness.count, default=9, help="turns of each sum")
     arguments.add_argument("--threads", type=harness.count, default=1, help="threads of the sums")
+    arguments.add_argument("--backend", choices=tuple(METHODS), default="fused", help="the sums")
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
-    harness.report(measure(options.quick, options.repeats), options.out)
+    harness.report(measure(options.backend, options.quick, options.repeats), options.out)
 
 
 if __name__ == "__main__":

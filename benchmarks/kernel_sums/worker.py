@@ -41,6 +41,7 @@ METHODS = {
     "keops_tutorial": "peers:KeopsTutorial",
     "keops_tuned": "peers:KeopsTuned",
     "diffrax": "peers_jax:Diffrax",
+    "c": "peers_c:C",
 }
 BATCH_SECONDS, BATCH_CALLS = 0.02, 200
 """Short calls are timed in batches: duration [s] and largest number of calls of a batch."""
