@@ -11,9 +11,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, number_of
 from diffeo_calib.common.data_frames import data_frame, facts_html, is_data_frame
-from diffeo_calib.common.device import HOST, usable
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError, as_written, printable
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program

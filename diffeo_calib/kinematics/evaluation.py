@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.rows import RowGroups

@@ -15,9 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     chosen_rows,

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.bodies import Bodies, bodies_of
 from diffeo_calib.measurements.checks import (
     arrays_sha256,

@@ -9,8 +9,8 @@ from simulated_camera import camera_arm
 from tangent_bank import Setting, normal, two_markers
 from torch import Tensor
 
-from diffeo_calib.calibration.robot_problem import robot_problem
-from diffeo_calib.calibration.scales.cross_validation import differing_factor
+from diffeo_calib.calibration.choose_scales import robot_problem
+from diffeo_calib.calibration.scales.differing_noise import differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.poses import LEVER

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
 from diffeo_calib.cli import record
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.kinematics.tool import HandEye
+from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat

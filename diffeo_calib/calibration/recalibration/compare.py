@@ -18,9 +18,8 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
 )
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
-from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.problem import Problem

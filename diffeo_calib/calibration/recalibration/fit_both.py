@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.placing.place import coordinates_of
 from diffeo_calib.calibration.recalibration.changes import ChangedPart, Drift, Transmission, parts_of
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
-from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem

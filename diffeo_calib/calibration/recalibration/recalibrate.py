@@ -38,9 +38,8 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

@@ -4,10 +4,8 @@ Points are sorted into blocks by halving the cloud across its longest side, unti
 interact if their boxes come closer than the distance beyond which the kernel and its first two derivatives are below
 the accuracy. It pays where length scales are much smaller than the cloud of points; fourier.py pays where they are not.
 
-Where a kernel and its spectral density are negligible, at length scale 1. For sums within an accuracy.
-
-Bounds hold for the kernel as a function of the difference of two points and for its first two derivatives, which all
-formulas are made of.
+Where a kernel and its spectral density are negligible is found at length scale 1, from samples. Bounds hold for the
+kernel as a function of the difference of two points and for its first two derivatives, of which all formulas are made.
 """
 
 from __future__ import annotations

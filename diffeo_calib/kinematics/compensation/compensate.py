@@ -25,8 +25,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, real_tensor
 from diffeo_calib.common.data_frames import named_columns
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.box_search import box_search, joint_limits, largest_motion, mobilities, rates
 from diffeo_calib.kinematics.compensation.chord import Box, reached

@@ -26,16 +26,7 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.estimate import (
-    Estimate,
-    Known,
-    Place,
-    Session,
-    anywhere,
-    at_old_places,
-    estimate,
-    session_of,
-)
+from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
     Registration,
@@ -43,6 +34,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import (
     turned,
     undetermined,
 )
+from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.maps.noise import mean_block
 from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.rows import RowGroups

@@ -26,10 +26,10 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.folder import cache_folder
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program
 from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions.keops import cache_folder
 from diffeo_calib.kernels.reductions.tiled import dealt
 
 DIGEST = hashlib.sha256().digest_size
