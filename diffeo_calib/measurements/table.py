@@ -452,16 +452,6 @@ class Measurements(ImageTable, SocketTable):
         largest = torch.bincount(self.session[self.session >= 0]).argmax()
         return self.rows(self.session == largest).with_sessions(None)
 
-    def check_one_set_up(self) -> None:
-        """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""
-        present = [] if self.session is None else [self.session_names[k] for k in self.session.unique() if k >= 0]
-        if len(present) > 1:
-            fix = (
-                "take those of one, register the model at those of another (`model.registered`), or bring those of "
-                "the fit into one frame (`result.aligned(data)`)"
-            )
-            raise MeasurementError.of("rows to compare a model with", expected="one set-up", got=few(present), fix=fix)
-
     def in_frames(self, transforms: Tensor) -> Measurements:
         """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.
 

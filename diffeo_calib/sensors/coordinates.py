@@ -218,6 +218,7 @@ class OtherDevices(Sensor):
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
             model.bodies.pose_lever()
+            check_frames(data, model)
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
@@ -284,6 +285,13 @@ def check_ball(model: Any, what: str, of: str, needed: str) -> None:
         fix = f"calibrate with {needed}; the marker of the model is not where the ball is"
         got = "one that was calibrated with measured positions"
         raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
+
+
+def check_frames(data: Readings, model: Any) -> None:
+    """Raise InputError for readings of more frames than a model has."""
+    needed, known = kind_of(data).seen_points // model.bodies.points, model.markers // model.bodies.points
+    if needed > known:
+        raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
 
 
 def check_tips(data: Measurements, own: tuple[str, ...]) -> None:

@@ -18,7 +18,7 @@ from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.pose_frames import POINTS
+from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 
@@ -66,7 +66,7 @@ class Devices(ABC):
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
-    """Points of the tool that it sees: the ball, or the three of a measured frame."""
+    """Points of the tool that it sees: the ball, or three of each measured frame."""
     numbers_each: ClassVar[int] = 1
     """Numbers r of a reading."""
     metres_each: ClassVar[float] = 1.0
@@ -118,8 +118,10 @@ class Devices(ABC):
 
     @classmethod
     def bodies(cls, points: Tensor) -> Tensor:
-        """What the devices see by its coordinates (N, 3 k), m: balls (N, 3), or poses of the frame (N, 4, 4)."""
-        return points if cls.seen_points == 1 else poses_of_triangles(points.unflatten(1, (POINTS, 3)))
+        """What the devices see by its coordinates (N, 3 k), m: balls (N, 3), a frame (N, 4, 4), or T (N, T, 4, 4)."""
+        if cls.seen_points == 1:
+            return points
+        return of_frames(poses_of_triangles(points.unflatten(1, (-1, POINTS, 3))))
 
     @classmethod
     def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:

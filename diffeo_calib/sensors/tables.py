@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.observations import unmixed
-from diffeo_calib.measurements.pose_frames import kind_of_points, points_of_frames
+from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
@@ -140,6 +140,11 @@ def check_poses(data: Any) -> None:
     if frames and "pose" not in kinds:
         fix = "measure poses too, which tell where the frame is on the tool and how large the robot is"
         raise MeasurementError.of(f"{few(list(frames))}s", expected="rows beside measured poses", got="none", fix=fix)
+    most = max((kind_of(part).seen_points for part in data.parts if sees_frame(part)), default=0)
+    shown = sum(part.markers for part in data.parts if part.kind == "pose")
+    if most > shown:
+        expected, got = f"poses of {most // POINTS} frames beside them", shown // POINTS
+        raise MeasurementError.of(f"{few(list(frames))}s", expected=expected, got=got, fix="measure all of them")
     if "pose" in kinds and len(kinds) > 1:
         got = " and ".join(f"{kind}s" for kind in kinds)
         fix = "give the positions of the poses alone (leave their rotation out)"

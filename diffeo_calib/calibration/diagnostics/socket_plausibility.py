@@ -22,6 +22,7 @@ from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, check_devices
+from diffeo_calib.sensors.tables import sees_frame
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
     """
     if not tables:
         return
-    tip = tables[0].on
+    balls = [table for table in tables if not sees_frame(table)]
+    tip = balls[0].on if balls else robot.tips[0]
     if tip is None and len(robot.tips) > 1:
         fix = "name the tip that carries the ball (`with_tips`), or load the robot with that one"
         raise InputError.of("readings of a robot with several tips", expected="one", got=few(robot.tips), fix=fix)
