@@ -207,8 +207,8 @@ class Readings(RowTable):
         """Readings of devices of any kind, which sensors/kinds.py knows or which is registered there.
 
         Args:
-            kind: of the devices, such as "line distance"; "held tool" for rows in which two hands hold a rigid tool, six
-                zeros each, see sensors/held_tool.py.
+            kind: of the devices, such as "line distance"; "held tool" where two hands hold a rigid tool, six zeros a
+                row, see sensors/held_tool.py.
             q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
             devices: (N,) name of each row's device; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.
