@@ -20,8 +20,12 @@ from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenSca
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful, lengths, warn_of_length
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
-from diffeo_calib.calibration.diagnostics.nominal_rows import check_not_nominal
-from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_joints,
+    check_limits,
+    check_not_nominal,
+    warn_of_outliers,
+)
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts

@@ -20,7 +20,6 @@ from typing import Any
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
@@ -31,7 +30,7 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     leave_one_out,
     tails_of_many,
 )
-from diffeo_calib.calibration.scales.selection import Selection, select
+from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median

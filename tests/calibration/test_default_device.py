@@ -29,10 +29,9 @@ from diffeo_calib.calibration.identification.registration import (
     register_robustly,
     with_joint_offsets,
 )
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterior, select
+from diffeo_calib.calibration.scales.selection import SearchLimits, defaults, log_posterior, select
 from diffeo_calib.calibration.student_t import Tails, reweight
 
 pytestmark = pytest.mark.slow  # several calibrations

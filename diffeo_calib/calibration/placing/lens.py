@@ -10,8 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera
-from diffeo_calib.cameras.lens import LENS
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained

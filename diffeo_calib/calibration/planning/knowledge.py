@@ -28,9 +28,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior, held_parameters
 from diffeo_calib.calibration.planning.sensors import Options, Scene
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import as_tensor
