@@ -24,7 +24,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.measurements.bodies import origins
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.tree import Tree
@@ -295,7 +295,7 @@ def _compared(placed: Placed, target: Rows) -> Tensor:
     Without a measuring device rigid motions of all of them do not.
     """
     count = len(target)
-    whole = torch.block_diag(*origins(placed.lever, target.target).expand(count, -1, -1))
+    whole = torch.block_diag(*bodies_of(placed.lever).averaging(target.target).expand(count, -1, -1))
     if not placed.free:
         return whole
     points = target.at.task[0].points.view(count, -1, 3)

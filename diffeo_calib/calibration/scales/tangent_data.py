@@ -118,6 +118,16 @@ class TangentData:
         """Number of coordinates that were measured."""
         return int(self.visible.sum())
 
+    @property
+    def measured_freedom(self) -> int:
+        """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
+        seen, freedom = self.noise_model.seen, self.noise_model.freedom
+        if not isinstance(freedom, int):
+            return int(freedom[seen].sum())
+        return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
+
+    # --- parts and variants, which share the linearisation ---
+
     def rows(self, index: Tensor) -> TangentData:
         """Some of the measurements."""
         sensor, tails = self.noise_model.rows(index), self.tails.rows(index)
