@@ -42,6 +42,8 @@ WHAT = {
     "heights": {("readings", "m")},
     "images": {("readings", "px")},
     "several kinds": {("errors", "m"), ("readings", "m"), ("readings", "px")},
+    "laser beams": {("errors", "m"), ("readings", "m")},
+    "inclinations": {("errors", "m"), ("readings", "mrad")},
 }
 """What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
 
@@ -427,10 +429,14 @@ def _(bench: Bench) -> None:
 # --- the table ------------------------------------------------------------------------------------------------------
 
 WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
+OWN = ("laser beams", "inclinations")
+"""Kinds of devices from outside the package, beside positions and beside poses."""
 BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
-NOT_YET: dict[tuple[str, str], str] = {}
+NOT_YET: dict[tuple[str, str], str] = {
+    **{(verb, kind): "refused" for verb in ("registered", "evaluate --register", "init") for kind in OWN},
+}
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
 """Verbs of seconds: but for positions and the table of several kinds they are slow tests."""

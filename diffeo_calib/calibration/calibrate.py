@@ -16,12 +16,16 @@ from typing import Literal
 
 import torch
 
-from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
+from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenScales, choose_scales, robot_problem
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful, lengths, warn_of_length
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
-from diffeo_calib.calibration.diagnostics.nominal_rows import check_not_nominal
-from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_joints,
+    check_limits,
+    check_not_nominal,
+    warn_of_outliers,
+)
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
@@ -29,12 +33,11 @@ from diffeo_calib.calibration.judgement import warn_of_contradictions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, few
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.fitted_map import FittedMap

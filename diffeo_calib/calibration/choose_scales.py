@@ -9,6 +9,8 @@
 5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
+
+The fitting problem of the exact model of a robot.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from typing import Any
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
-from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -28,11 +30,13 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     leave_one_out,
     tails_of_many,
 )
-from diffeo_calib.calibration.scales.selection import Selection, select
+from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
+from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.maps.noise import Noise
 
 
 @dataclass(frozen=True)
@@ -267,3 +271,27 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     _, some = data.sample(POSES, COORDINATES, seed)
     tried = [replace(scales, payload=factor) for factor in FACTORS]
     return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))
+
+
+RESIDUAL_TOLERANCE = 1e-5
+"""Of coupling and end residual: the remaining error is far below the noise."""
+
+
+def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
+    """Measurements of a robot, with the kernels, priors and noise that the scales determine.
+
+    Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
+    """
+    problem = Problem(
+        data.nominal.typical,
+        data.x,
+        data.y,
+        joint_kernel=scales.joint_kernel(data.space),
+        task_kernel=scales.task_kernel(),
+        noise=Noise(data.weighted_noise(scales), data.shared),
+        markers=data.nominal.geometry.markers,
+        prior_variance=data.prior_variance(scales),
+        new_noise=new_noise(data, scales),
+        observe=data.observe,
+    )
+    return problem.with_nominal_of_rows(data.nominal)

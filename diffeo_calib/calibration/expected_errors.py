@@ -31,12 +31,9 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.bodies import origins
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.tables import device_coordinates
 
 
@@ -161,7 +158,7 @@ def expected_errors(
 
 def _shown(model: CalibratedKinematics) -> Tensor:
     """(r, m) what expected errors are of: the ball if the model has one, else all markers, or origins of poses."""
-    every = origins(model.lever, model.map.new_noise)
+    every = model.bodies.averaging(model.map.new_noise)
     by_device = device_coordinates(model.map.m, ball=model.ball, free=stands_free(model))
     return every[-3:] if by_device < model.map.m else every
 
@@ -249,7 +246,7 @@ def _name(direction: Tensor, model: CalibratedKinematics) -> str:
     number = int(markers.norm(dim=1).argmax()) if len(markers) else 0
     if not len(markers) or float(markers[number].norm()) < MARKER_SHARE * float(base.norm()):
         return "the place of the measuring frame"
-    what = body_kind(model.lever).name(number, len(model.geometry.on))
+    what = model.bodies.name(number, len(model.geometry.on))
     axis = "xyz"[int(markers[number].abs().argmax())]
     return f"the place of the {what} on '{printable(model.geometry.on[number])}' along {axis}"
 

@@ -13,8 +13,7 @@ from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Ste
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
-from diffeo_calib.common.quantiles import chi2_above, chi2_median
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     expected_covariance,
@@ -24,7 +23,6 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
 )
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
@@ -73,10 +71,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
     NaN for hidden markers.
     """
-    bodies = bodies_of(data)
-    mean, covariance = bodies.predicted(model.at_payloads(data.payload))
-    errors = bodies.errors(mean)
-    solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
+    found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+    errors = data.bodies.errors(data, found.points)
+    solved = torch.linalg.solve(found.covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
 
 
@@ -186,7 +183,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     """
     for table, _ in divided(data)[1]:
         devices = places.devices[sensor_key(table)]
-        away = devices.errors(table, model(table.q).detach()[:, -1]).norm(dim=1)
+        away = devices.errors(table, devices.points_of(model(table.q).detach())).norm(dim=1)
         if implausibly_far(model, float(away.median())):
             what, got = (
                 "these errors are not those of a calibrated robot",

@@ -21,8 +21,8 @@ from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
@@ -147,7 +147,7 @@ class CalibrationResult:
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-        return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
+        return devices, devices.errors(data, devices.points_of(self.stages[stage](data.q).detach()))
 
     @property
     def left_out_rms(self) -> float:

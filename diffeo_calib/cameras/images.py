@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import BOARD, BoardPrior, board_slopes, real_board
-from diffeo_calib.cameras.lens import LENS, project, project_slopes
+from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 

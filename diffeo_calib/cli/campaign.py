@@ -23,7 +23,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
 
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED
+from diffeo_calib.cli.console import EXIT_INTERRUPTED
 from diffeo_calib.common.errors import InputError, as_written
 
 if sys.version_info >= (3, 11):

@@ -12,7 +12,7 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
-from diffeo_calib.cli.places import check_outputs, make_folder
+from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
 DEMO_ROWS = 300

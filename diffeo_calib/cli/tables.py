@@ -30,6 +30,7 @@ from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.kinds import known_kinds
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
@@ -417,6 +418,9 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
+    own = None if kind in (*KINDS, "image") else known_kinds().get(kind)
+    if own is not None and len(words) == own.numbers_each and all(words):
+        return ReadingColumns(kind, words, device, unit=own.unit)
     expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
-from diffeo_calib.common.device import HOST, seeded, usable
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, seeded, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.maps.deformation import Deformation, Momenta, inverse_of
 from diffeo_calib.maps.geodesic import GeodesicDeformation

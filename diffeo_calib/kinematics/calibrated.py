@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, number_of
-from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.common.data_frames import data_frame, facts_html, is_data_frame
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
+from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
-from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
@@ -23,10 +22,12 @@ from diffeo_calib.kinematics.re_registration.register_again import devices_besid
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     directions_of_frames,
     frames_of_points,
+    kind_of_points,
     of_frames,
     own_blocks,
 )
@@ -35,9 +36,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.coordinates import check_joint_order
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 
 
 @methods_outside_inference_mode
@@ -268,7 +268,44 @@ class CalibratedKinematics:
         fitted = f"fitted to {len(self.configurations)} poses"
         return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, {fitted})"
 
-    _repr_html_, to_frame = model_html, predicted_frame
+    def _repr_html_(self) -> str:
+        """For notebooks: robot, measurements, errors at the fit and provenance."""
+        robot, made, found = self.robot, self.provenance, self.summary
+        facts: dict[str, object] = {
+            "robot": f"{printable(robot.name)}, {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints",
+            "measured": measured_words(self),
+            "rows of the fit": len(self.configurations),
+        }
+        if found is not None:
+            facts["geometric calibration, RMS"] = f"{1e3 * found.geometry_rms:.4f} mm on the rows of the fit"
+            facts["calibrated, RMS"] = f"{1e3 * found.leave_one_out_rms:.4f} mm, each row predicted by all others"
+        if self.registration is not None:
+            facts["registered anew"] = f"{self.registration.rows} rows, RMS {1e3 * self.registration.rms_after:.4f} mm"
+        if made is not None:
+            facts["fitted"] = f"{made.date[:10]} with version {made.version}, table sha256 {made.table_sha256[:12]}"
+            if made.note:
+                facts["note"] = printable(made.note)
+        return facts_html("Calibrated kinematics", facts)
+
+    def to_frame(self, q: Any) -> Any:
+        """Predicted markers with the standard deviations of a new measurement, as a pandas.DataFrame in m.
+
+        Args:
+            q: (N, n) joint values, rad or m, or a data frame, whose index is kept.
+
+        Returns:
+            columns x, y, z, std_x, std_y, std_z; marker1_x, ... with several markers, ball_x, ... of a ball beside
+            them. Poses: the origin of their frame, and a rotation vector rx, ry, rz [rad] with deviations about the
+            axes of the measuring frame; TIP_x, ... of several.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        found = self.bodies.predicted(self, q)
+        names = [f"{prefix}{name}" for prefix in self.bodies.prefixes(self) for name in found.names]
+        mean, std = found.mean.flatten(1), found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
+        columns = dict(zip([*names, *(f"std_{name}" for name in names)], [*mean.T, *std.T], strict=True))
+        return data_frame(columns, getattr(q, "index", None) if is_data_frame(q) else None)
 
     @property
     def configurations(self) -> Tensor:
@@ -429,3 +466,8 @@ class CalibratedKinematics:
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]
+
+
+def measured_words(model: Any) -> str:
+    """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
+    return kind_of_points(model.markers, model.lever)

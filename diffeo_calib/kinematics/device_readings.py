@@ -22,7 +22,7 @@ from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.bodies import Predicted
 from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations

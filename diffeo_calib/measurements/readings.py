@@ -15,9 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     chosen_rows,
@@ -208,7 +207,8 @@ class Readings(RowTable):
         """Readings of devices of any kind, which sensors/kinds.py knows or which is registered there.
 
         Args:
-            kind: of the devices, such as "line distance".
+            kind: of the devices, such as "line distance"; "held tool" where two hands hold a rigid tool, six zeros a
+                row, see sensors/held_tool.py.
             q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
             devices: (N,) name of each row's device; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import Any
 
 from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

@@ -11,7 +11,7 @@ from simulated_camera import camera_arm
 from tangent_bank import Setting, normal, two_markers
 from torch import Tensor
 
-from diffeo_calib.calibration.robot_problem import robot_problem
+from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.differing_noise import differing_factor, noise_of_new_rows
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE

@@ -46,10 +46,10 @@ from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
+from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
 
 ALIKE = 0.05

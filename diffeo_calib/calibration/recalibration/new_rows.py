@@ -29,12 +29,11 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.regions import region_scale
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.sensors.places import fitting_devices
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
@@ -370,8 +369,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
 
 def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
     """The devices of readings around the points of the old model."""
-    ball = seen[rows, -3:]
-    devices = kind_of(table).at(table, ball).refined(table, ball)
+    devices = fitting_devices(table, seen[rows].unflatten(1, (-1, 3)))
     return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
 
 
@@ -408,8 +406,8 @@ def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
     Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
     each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
     """
-    bodies, whole = bodies_of(new), fitted.slopes is None and bool(fitted.noise.visible.all())
-    own, old = bodies.modes, bodies.modes_of(fitted.measured().unflatten(1, (-1, 3))) if whole else None
+    bodies, whole = new.bodies, fitted.slopes is None and bool(fitted.noise.visible.all())
+    own, old = bodies.modes(new), bodies.modes_of(new, fitted.measured().unflatten(1, (-1, 3))) if whole else None
     if own is None or old is None:
         block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
         return block.expand(len(new), -1, -1)

@@ -23,8 +23,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.drift import usual_drift
-from diffeo_calib.calibration.recalibration.fit_both import fit_both
+from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
@@ -39,17 +38,15 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.register_again import warn_about
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
+from diffeo_calib.robots.placement import PLACES
 
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}

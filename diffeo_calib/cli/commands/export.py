@@ -14,9 +14,8 @@ from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.options import Export
-from diffeo_calib.cli.places import make_folder
 from diffeo_calib.cli.printed import placement_lines
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files

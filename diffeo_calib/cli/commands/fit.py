@@ -14,8 +14,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import KindErrors, errors_by_kind
-from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.printed import (
     ErrorTable,
@@ -30,7 +29,7 @@ from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye

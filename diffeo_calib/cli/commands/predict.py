@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -11,8 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.interrupts import Progress
+from diffeo_calib.cli.console import Progress, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
@@ -22,7 +21,6 @@ from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.evaluation import OutsideRange
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
@@ -63,7 +61,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     for line in provenance_lines(kinematics):
         say(line)
     table, joints = _written_as_read(kinematics, given)
-    robot, with_poses, bodies = kinematics.robot, kinematics.lever is not None, body_kind(kinematics.lever)
+    robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
@@ -79,7 +77,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = (_predicted(bodies.predicted, readings, rows.carried_by(kinematics), rows.q) for rows in laden)
+        blocks = (_predicted(readings, rows.carried_by(kinematics), rows.q) for rows in laden)
         write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes, more=readings.names)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
@@ -126,11 +124,9 @@ def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     return f"{' '.join(options)} --convention {written.convention}{unit}"
 
 
-def _predicted(
-    of_bodies: Callable[..., tuple[Tensor, Tensor]], readings: _Readings, model: CalibratedKinematics, q: Tensor
-) -> Predictions:
-    """Joint values, means and standard deviations of the bodies, and cells of the devices' readings."""
-    mean, covariance = of_bodies(model, q)
+def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor) -> Predictions:
+    """Joint values, means and standard deviations of markers or poses, and cells of the devices' readings."""
+    mean, covariance = model.bodies.written(model, q)
     return q, mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt(), readings.cells(model, q)
 
 

@@ -10,8 +10,7 @@ import typer
 from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
-from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import record

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
 from diffeo_calib.measurements.csv.images import image_sheet

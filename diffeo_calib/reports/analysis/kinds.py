@@ -66,7 +66,8 @@ class KindFindings:
 
 def of_positions_alone(model: CalibratedKinematics, data: Any) -> bool:
     """Whether a device measured a position, or pose, of every marker of the model in all rows."""
-    return not model.ball and (data is None or {part.kind for part in data.parts} <= {"position", "pose"})
+    others = model.ball or model.map.unregistered.slopes is not None
+    return not others and (data is None or {part.kind for part in data.parts} <= {"position", "pose"})
 
 
 def find_kinds(

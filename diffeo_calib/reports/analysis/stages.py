@@ -11,13 +11,12 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.robust_registration import register_robustly
+from diffeo_calib.calibration.identification.registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.sensors.errors import Evaluation
@@ -110,7 +109,7 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
     q = q.to(model.configurations.device)
-    _, _, covariance = body_kind(model.lever).shown(model, q, noise=False)
+    covariance = model.bodies.predicted(model, q, noise=False).places
     return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
 
 

@@ -8,8 +8,7 @@ import torch
 
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
-from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.measurements.body_kinds import body_kind
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
@@ -105,7 +104,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     far = rough_millimetres(expected.error.whole)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
     if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
-        what = body_kind(model.lever).name(number, len(found.rows.on))
+        what = model.bodies.name(number, len(found.rows.on))
         known = f"{rough_millimetres(float(deviation))} mm along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
             f"{far}, because {what} and base can hardly be told apart (the {what} is known to {known}). To change "

@@ -17,8 +17,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
-from diffeo_calib.calibration.scales.defaults import defaults
-from diffeo_calib.calibration.scales.selection import log_posterior
+from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import InputError, MeasurementError
