@@ -30,7 +30,6 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.places import Places, sensor_key

@@ -49,8 +49,8 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     """Compare kinematics with measurements.
 
     Rows of one set-up of the fit are compared in its frame. Devices that a model does not know are placed on the rows,
-    and the result says how many numbers that took: the frames of several set-ups, or of a new one, or of positions beside a model that was calibrated without a measuring device; the
-    devices of readings; the middles of sockets.
+    and the result says how many numbers that took: the frames of several set-ups, of a new one, or of positions beside
+    a model that was calibrated without a measuring device; the devices of readings; the middles of sockets.
 
     Args:
         kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring frame: a calibrated
