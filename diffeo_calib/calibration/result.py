@@ -27,8 +27,8 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
+from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.places import Places, sensor_key
@@ -116,9 +116,10 @@ class CalibrationResult:
         found, worst = ExpectedError.of(self.model), doubtful(self.lengths)
         return found if worst is None else found.in_doubt(worst.displacement * 3**0.5)
 
-    def aligned(self, data: Measurements) -> Measurements:
-        """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
-        return self.placement.aligned(data)
+    def aligned(self, data: Any) -> Any:
+        """Rows of the same sessions in the frame of the model; those without positions, and of one session, stay."""
+        parts = [own if own.without_device else self.placement.aligned(own) for own in data.parts]
+        return Observations(parts, data.index) if len(parts) > 1 else parts[0]
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

@@ -194,7 +194,7 @@ def correct_command(
         Path,
         typer.Argument(metavar="PROGRAM", help="Table with a header, one command per row; other columns are kept."),
     ],
-    units: options.Units,
+    units: options.StoredUnits,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")],
     given: options.Correction,
 ) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -31,6 +31,7 @@ from diffeo_calib.sensors.places import (
     SOCKET,
     PlacedDevices,
     Places,
+    SessionPlaces,
     place_sessions,
     placed,
     sensor_key,
@@ -50,12 +51,14 @@ class Beside:
     Args:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
         devices: those of readings whose places are known, by kind.
+        frames: name of a set-up of positions -> (4, 4) transform from the frame of the kinematics to its own, m.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
     """
 
     points: Callable[[Any], Tensor]
     devices: Mapping[str, Devices]
+    frames: Mapping[str, Tensor] = field(default_factory=dict)
     unplaced: bool = False
     every_session: bool = False
 
@@ -111,7 +114,10 @@ class Positions(Sensor):
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of several set-ups, or of rows that no device shares with the model."""
         names = {name for name in data.device_names if name}
-        if len(names) > 1 or (beside.every_session and names):
+        if len(names) == 1 and names <= set(beside.frames) and not beside.every_session:
+            (name,) = names
+            return Places(SessionPlaces((name,), beside.frames[name][None]))
+        if len(names) > 1 or ((beside.every_session or beside.frames) and names):
             frames = place_sessions(beside.points(data), data)
         elif beside.unplaced:
             frames = place_sessions(beside.points(data), data if names else data.with_sessions([ROWS] * len(data)))

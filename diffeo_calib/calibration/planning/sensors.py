@@ -354,7 +354,7 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
         return (*found, *(DeviceReadings(None, devices, moved[rows].any(0)) for rows, devices in known))
     for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
-        found.append(_device(model, (rows, own), f" {len(found) + 1}"))
+        found.append(_device(model, (rows, own), _name(model, rows)))
     return tuple(found)
 
 
@@ -379,7 +379,21 @@ def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
     return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
 
 
-def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
+def _name(model: CalibratedKinematics, rows: Tensor) -> str:
+    """Name of the device that measured some rows (N,) of a fit, after its kind where another kind has the same name.
+
+    Files of old versions hold no names.
+    """
+    first = int(rows.nonzero()[0, 0])
+    for own in model.placement:
+        for name, row in zip([own.names[number] for number in own.device.tolist()], own.rows.tolist(), strict=True):
+            if row == first:
+                alone = sum(name in other.names for other in model.placement) == 1
+                return name if alone else f"{own.kind} {name}"
+    return f"device of row {first}"
+
+
+def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) -> DeviceReadings:
     """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects."""
     (rows, columns), fitted = own, model.map
     if fitted.slopes is None:
@@ -393,7 +407,7 @@ def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], number: str
         constants = kind.seen_by(slopes, effects / deviations, ball)
         if constants is None:
             continue
-        devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
+        devices = kind((name,), constants[None], deviations)
         again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
             return DeviceReadings(None, devices, columns)
