@@ -76,7 +76,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LONGEST_FILE:
             raise InputError.of(f"{path}", expected="a file of options", got="more than 1 MiB")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
