@@ -15,6 +15,7 @@ The fitting problem of the exact model of a robot.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,12 +31,14 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     leave_one_out,
     tails_of_many,
 )
+from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
 
 
@@ -92,6 +95,7 @@ def choose_scales(
     identification: Identification,
     *,
     given: Hyperparameters | None = None,
+    models: Sequence[CalibratedKinematics] = (),
     seed: int = 0,
     progress: Progress = silent,
 ) -> ChosenScales:
@@ -100,7 +104,8 @@ def choose_scales(
     Args:
         data: the measurements around the geometric calibration. measurements: the same as they were measured.
         registration: base and markers. identification: the geometric calibration.
-        given: scales that are used as they are.
+        given: scales that are used as they are. models: of robots of the same type, whose scales are used, inflated
+            where leave-one-out errors contradict them.
         seed: draws the poses on which scales are selected.
         progress: called as ``progress(task, done, total)``.
 
@@ -109,13 +114,16 @@ def choose_scales(
     """
     rows, some = data.sample(len(data.x), LIMITS.coordinates, seed)
     if len(rows) < len(data.x):
-        stages = registration, identification
-        chosen = choose_scales(some, measurements[rows], *stages, given=given, seed=seed, progress=progress)
+        stages, how = (registration, identification), {"given": given, "models": models}
+        chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
         return _of_all_rows(chosen, data, seed)
     if given is not None:
         return _given(given, data, seed)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
+    if models:
+        found, data = _of_models(models, centre, data, seed)
+        return _inflated(found, None, data, measurements, seed=seed, progress=progress)
     if poses < LIMITS.fewest_poses:
         found = _defaults_of_few(centre, poses, len(measurements))
     else:
@@ -128,9 +136,20 @@ def choose_scales(
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
+def _of_models(
+    models: Sequence[CalibratedKinematics], centre: Hyperparameters, data: TangentData, seed: int
+) -> tuple[Selection, TangentData]:
+    """The scales of models of the same type of robot, and the measurements with the weights that follow."""
+    scales = scales_of_models(models, centre)
+    data = data.with_gear_lines(scales.lines)
+    scales = with_payload_factor(data, scales, seed)
+    status = f"those of {len(models)} other model{'s' * (len(models) > 1)}"
+    return Selection(scales, status), data.with_tails(estimate_tails(data, scales, seed))
+
+
 def _inflated(
     found: Selection,
-    centre: Hyperparameters,
+    centre: Hyperparameters | None,
     data: TangentData,
     measurements: Any,
     *,
@@ -171,7 +190,7 @@ def _of_all_rows(chosen: ChosenScales, data: TangentData, seed: int) -> ChosenSc
 
 
 def _inflation(
-    centre: Hyperparameters,
+    centre: Hyperparameters | None,
     found: Selection,
     data: TangentData,
     measurements: Any,
@@ -180,11 +199,11 @@ def _inflation(
     seed: int,
     progress: Progress,
 ) -> tuple[float, Selection]:
-    """Factor on all variances, and the selection, interrupted if Ctrl-C came."""
+    """Factor on all variances, and the selection, interrupted if Ctrl-C came; no ``centre``: scales of other robots."""
     groups = measurements.groups().to(data.x.device)
     poses = int(groups.max()) + 1
     factor = left_out.inflation(poses)
-    if poses < LIMITS.fewest_poses or found.interrupted:
+    if centre is not None and (poses < LIMITS.fewest_poses or found.interrupted):
         return factor, found
     inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
     return inflation or factor, replace(found, interrupted=inflation is None)

@@ -44,13 +44,15 @@ def fit_command(
     fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     outputs = {"-o": output, "--figure": given.figure, "--report": given.report}
-    check_outputs(outputs, {"CSV": csv, "--robot": robot.robot})
+    others = given.scales_of or []
+    check_outputs(outputs, {"CSV": csv, "--robot": robot.robot} | {f"--scales-of {other}": other for other in others})
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
     links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
     files = fit.Outputs(output, given.figure, given.report)
     how = {"holdout": given.holdout, "seed": given.seed, "controls": given.controls, "note": given.note}
+    how["scales_of"] = others
     fit.run(links, measured_table(csv, rows, units, duplicates), files, **how)
 
 

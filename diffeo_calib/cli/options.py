@@ -267,6 +267,9 @@ class FitOptions:
     figure: Path | None = option("Also draw the errors (of the held-out rows, if any).", "IMAGE")
     report: Path | None = option("Also write the report: one page that needs neither a network nor a server.", "HTML")
     note: Note = ""
+    scales_of: list[Path] | None = option(
+        "Model of another robot of the same type, whose scales are used: for few rows. May be repeated.", "MODEL"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,6 +47,8 @@ OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "p
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
+SCALES = "scales"
+"""Scales of kernels, priors and noise; the first model files did not have them."""
 GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
 """Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
@@ -91,6 +93,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
+    if isinstance(model, CalibratedKinematics) and model.scales is not None:
+        tensors[SCALES] = model.scales
     header: Header = {
         "format": FORMAT,
         "units": UNITS,
@@ -193,12 +197,12 @@ def rebuild(
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
-        chain = spec.nominal.geometry.chain
         given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
-        given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "ball": header.get("ball", False) is True}
+        given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "scales": tensors.get(SCALES)}
+        given["ball"] = header.get("ball", False) is True
         given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
-        return CalibratedKinematics(chain, fitted, summary, **given)
+        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, summary, **given)
     if header["lever"] is not None:
         raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
     return fitted
@@ -213,7 +217,9 @@ def _check_names(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if isinstance(nominal, GeometryMap) and nominal.payload is not None:
         expected |= set(PAYLOADS)
-    optional = {DATA, SLOPES, MEASURED} | ({RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else set())
+    optional = {DATA, SLOPES, MEASURED} | (
+        {RIGID_ERRORS, SCALES, WORKSPACE} if isinstance(nominal, GeometryMap) else set()
+    )
     if set(tensors) - optional != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
 
@@ -244,11 +250,15 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "new_noise": (m, m),
     } | {name: (rows, n) for name, rows in ((DATA, data), (WORKSPACE, "M")) if name in tensors}
     own = {SLOPES: (data, seen, m), MEASURED: (data, seen)}
+    if isinstance(nominal, GeometryMap):
+        own[SCALES] = (5 * n + 2 * nominal.geometry.chain.moving + 9,)
     shapes |= {name: shape for name, shape in own.items() if name in tensors}
     for name, shape in shapes.items():
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
+    if SCALES in tensors and bool((tensors[SCALES] < 0).any()):
+        raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors[SCALES].min()))
     new = tensors["new_noise"]
     skewed = bool(((new - new.mT).abs() > 1e-9 * new.abs().max()).any())
     if skewed or int(torch.linalg.cholesky_ex(new).info):

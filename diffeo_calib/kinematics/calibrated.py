@@ -58,6 +58,7 @@ class CalibratedKinematics:
         provenance: when the model was fitted, with what and to which table; None if that is not known.
         ball: whether the last marker is a ball whose position no device measured; so it is if none was measured at all.
         placement: devices of the fit in unknown places: measuring frames of sessions, sockets, devices of readings.
+        scales: scales of kernels, priors and noise as one vector, see ``Hyperparameters.vector``; None if unknown.
 
     Raises:
         InputError: a lever that is not positive, or one for a number of points that is no multiple of three; error
@@ -77,6 +78,7 @@ class CalibratedKinematics:
         provenance: Provenance | None = None,
         ball: bool = False,
         placement: tuple[PlacedDevices, ...] = (),
+        scales: Tensor | None = None,
     ) -> None:
         self.bodies = bodies_of(lever)
         self.bodies.check_points(map.m // 3)
@@ -91,6 +93,7 @@ class CalibratedKinematics:
         self.provenance = provenance
         self.ball = ball or map.workspace is not None
         self.placement = placement
+        self.scales = scales
 
     @property
     def has_tool(self) -> bool:
@@ -462,7 +465,7 @@ class CalibratedKinematics:
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
         names = ["robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball"]
-        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement"]} | changes)
+        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement", "scales"]} | changes)
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

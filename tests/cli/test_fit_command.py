@@ -55,6 +55,26 @@ def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.Calibrate
     assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
 
 
+def test_fit_with_the_scales_of_another_robot(
+    model: dc.CalibratedKinematics, site: Site, command: Command, tmp_path: Path
+) -> None:
+    known, own = site.folder / "model.safetensors", tmp_path / "own.safetensors"
+    assert command(*site.fit(site.csv, own, "--scales-of", known)).code == 0
+    found = dc.load(own)
+    assert isinstance(found, dc.CalibratedKinematics)
+    assert found.scales is not None
+    assert model.scales is not None
+    ratios = (found.scales / model.scales)[model.scales > 0]
+    assert torch.unique(ratios.round(decimals=6)).numel() == 2  # length scales and factors; deviations
+    assert float(ratios.min()) == pytest.approx(1.0) or float(ratios.max()) == pytest.approx(1.0)
+
+
+def test_scales_of_what_is_no_model_are_refused(site: Site, command: Command, tmp_path: Path) -> None:
+    done = command(*site.fit(site.csv, tmp_path / "own.safetensors", "--scales-of", site.csv))
+    assert done.code == 1
+    assert "measured.csv" in done.err
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ OPTIONS = {
             "--duplicates",
             "--figure",
             "--note",
+            "--scales-of",
             "--report",
             "--jobs",
         ),

@@ -221,6 +221,16 @@ class Hyperparameters:
         parts = torch.split(vector.exp(), [s.numel() for s in shapes])
         return replace(self, **{name: p.reshape(s) for name, p, s in zip(self.searched, parts, shapes, strict=True)})
 
+    @property
+    def vector(self) -> Tensor:
+        """All scales that any measurements have as one vector, without gear lines, as model files hold them."""
+        return torch.cat([getattr(self, name).reshape(-1) for name in SCALES])
+
+    def with_vector(self, vector: Tensor) -> Hyperparameters:
+        """The inverse of :attr:`vector`, shaped like this object; the noise of further devices is kept."""
+        alone = replace(self, other_noise=None)
+        return replace(alone.from_logarithms(vector.log()), other_noise=self.other_noise)
+
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
         scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in self.searched]

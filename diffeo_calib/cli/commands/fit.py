@@ -15,7 +15,7 @@ from diffeo_calib.calibration.judgement import contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
-from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.models import load_kinematics, made_by_command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -85,15 +85,15 @@ def run(
     seed: int,
     controls: int | None,
     note: str = "",
+    scales_of: Sequence[Path] = (),
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
-        chain = robot.read()
+        chain, others = robot.read(), [load_kinematics(path) for path in scales_of]
         data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-        number = "auto" if controls is None else controls
-        watched = interrupts.watching(progress, err.print)
-        result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
+        how = {"controls": controls or "auto", "seed": seed, "note": note, "scales_of": others}
+        result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
     hand_eye = hand_eye_of(result)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
