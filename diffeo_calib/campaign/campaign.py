@@ -124,6 +124,17 @@ class Campaign:
             self._add(row)
         return self.verdicts[start:]
 
+    @small_work()
+    def resume(self, table: Table, verdicts: Sequence[Verdict]) -> None:
+        """Go on with rows that an earlier campaign judged; InputError unless there is one verdict for each of them."""
+        check_arguments(self.robot, table, None)
+        if len(self) or len(table) != len(verdicts):
+            raise InputError.of("`verdicts`", expected=f"{len(table)}, of a new campaign", got=str(len(verdicts)))
+        rows: Any = table
+        self.table = rows.with_line_numbers(torch.arange(len(rows), device=HOST))
+        self.verdicts = list(verdicts)
+        self._renew()
+
     def accept(self, row: int) -> None:
         """Take a row in, whatever its verdict."""
         self._decide(row, accepted=True)
