@@ -131,6 +131,10 @@ class SessionFrames(DeviceSet):
         numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
         return data.in_frames(torch.linalg.inv(self.transforms)[numbers])
 
+    def groups(self) -> list[tuple[str, Tensor]]:
+        """See :class:`DeviceSet`."""
+        return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
+
     @property
     def others(self) -> list[int]:
         """Numbers of the sessions but the reference."""
