@@ -154,6 +154,32 @@ def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] |
     return place
 
 
+LARGE_PER_REACH, LARGE_PER_USUAL = 0.01, 20.0
+"""Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
+are no errors of a calibrated robot."""
+MOST_LARGE = 0.25
+"""Share of the rows from which such errors fail a fit."""
+
+
+def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:
+    """Raise MeasurementError if so many positions are far from a model that it holds for a part of the rows alone.
+
+    Args:
+        model: the fitted model. found: errors of positions, of rows that were held out if there are any.
+        usual: median error of the rows of the fit after a geometric calibration, m.
+    """
+    limit = max(LARGE_PER_REACH * model.robot.reach, LARGE_PER_USUAL * usual)
+    share = float((known(found.errors) > limit).double().mean())
+    if share > MOST_LARGE:
+        raise MeasurementError.of(
+            f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
+            expected="errors of a calibrated robot",
+            got=f"an RMS error of {1e3 * found.rms:.4g} mm",
+            fix="did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
+            "holds for a part of the rows at most",
+        )
+
+
 LARGE_PER_EXPECTED = 2.0
 """RMS errors from this multiple of the expected ones on are warned about."""
 

@@ -350,7 +350,9 @@ class FittedMap:
     def joint_covariance(self, x: Tensor) -> Tensor:
         """Posterior covariance of all coordinates of k1 at x (M, n) together: (M m, M m), m^2."""
         points, at = self.geodesic.linearised_value(x)
-        return self.covariance_between(at.projected(torch.eye(self.m).to(points).expand(len(x), -1, -1)))
+        return self.covariance_between(
+            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1))
+        )
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.

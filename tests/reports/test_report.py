@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
+from kind_bank import kind_named
 from lxml import html
 from product_bank import Case, usual_scales
 from simulated_body import HANDS, SimulatedUpperBody
@@ -16,9 +17,13 @@ from simulated_body import HANDS, SimulatedUpperBody
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.kinds import find_kinds
+from diffeo_calib.reports.report import judged
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.tables import divided
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
 SHOWN = 40
@@ -274,6 +279,17 @@ def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command
         assert done.code == 0, done.err
         assert sentence in done.out
         assert sentence in out.read_text(encoding="utf-8").replace("\u00a0", " ")
+
+
+def test_measured_positions_decide_about_a_tolerance() -> None:
+    """The error that a model of several kinds expects of itself is below it; new rows are not."""
+    kind = kind_named("mixture")
+    tracked, _ = divided(kind.new)[0]
+    wrong = with_attributes(tracked, points=tracked.points + 0.003 * torch.sin(97.0 * tracked.points))
+    found = find_kinds(kind.model, wrong)
+    assert found.deviations.error.whole < 1e-3 < found.rms
+    assert judged(found, 1e-3).startswith("Above")
+    assert judged(find_kinds(kind.model, None), 1e-3).startswith("Within")
 
 
 def test_a_tolerance_is_a_length(files: tuple[Path, Path], tmp_path: Path, command: Command) -> None:

@@ -127,6 +127,10 @@ class DeviceSet(ABC):
         """What of these devices may change during the measurements, with its effects (N, R, U) on all rows."""
         return ()
 
+    def groups(self) -> Iterable[tuple[str, Tensor]]:
+        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
+        return ()
+
     def doubts(self, data: SeenRows) -> Iterable[Cause]:
         """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
         return ()
@@ -160,6 +164,10 @@ class Placement:
     def changes(self, data: SeenRows) -> list[Cause]:
         """What of all devices may change."""
         return [cause for own in self.sets for cause in own.changes(data)]
+
+    def groups(self) -> Iterable[tuple[str, Tensor]]:
+        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
+        return ()
 
     def doubts(self, data: SeenRows) -> list[Cause]:
         """What all devices are said to hold."""

@@ -125,6 +125,10 @@ class SessionFrames(DeviceSet):
         """
         return data.in_frames(torch.linalg.inv(self.transforms)[self.numbers(data)])
 
+    def groups(self) -> list[tuple[str, Tensor]]:
+        """See :class:`DeviceSet`."""
+        return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
+
     @property
     def others(self) -> list[int]:
         """Numbers of the sessions but the reference."""

@@ -373,21 +373,19 @@ class Group(NamedTuple):
 def groups_of(rows: NewRows) -> dict[str, Group]:
     """Sessions, if there are several, and else the block of rows that hardly count, by their names."""
     data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
-    if not rows.before.sessions:
-        numbers = data.line_numbers if len(data.line_numbers.unique()) == len(data) else torch.arange(len(data))
-        order = numbers.to(HOST).argsort()
-        place = find_block(flags[order])
-        if place is None or place[1] - place[0] < FEWEST_ROWS:
-            return {}
-        lines = numbers[order][place[0] : place[1]].tolist()
-        return {f"rows {lines[0]} to {lines[-1]}": Group(order[place[0] : place[1]], deviates=True)}
-    (frames,) = rows.before.sessions
-    found = {}
-    for number, name in enumerate(frames.names):
-        own = (frames.session == number).nonzero()[:, 0]
-        deviates = float(flags[own].double().mean()) > MOST_OUTLIERS
-        found[f"session '{name}'"] = Group(own, deviates=deviates)
-    return found
+    named = [group for one in rows.before.sessions for group in one.groups()]
+    if named:
+        return {name: Group(own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
+    numbers = (
+        data.line_numbers if len(data.line_numbers.unique()) == len(data) else torch.arange(len(data), device=HOST)
+    )
+    order = numbers.to(HOST).argsort()
+    place = find_block(flags[order])
+    if place is None or place[1] - place[0] < FEWEST_ROWS:
+        return {}
+    block = order[place[0] : place[1]]
+    lines = numbers[block].tolist()
+    return {f"rows {lines[0]} to {lines[-1]}": Group(block, deviates=True)}
 
 
 def _unknown(rows: NewRows, where: str, level: float) -> Change:

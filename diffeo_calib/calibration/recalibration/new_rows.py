@@ -414,9 +414,9 @@ def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
     blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
     to_modes = torch.linalg.pinv(old)
     sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
-    apart = torch.eye(old.shape[2]).to(old) - old @ to_modes
+    eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
+    apart = eye - old @ to_modes
     slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
-    eye = torch.eye(old.shape[2]).to(old)
     return block_diagonal((own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye)
 
 

@@ -11,7 +11,7 @@ import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.judgement import contradicted
+from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
@@ -113,8 +113,16 @@ def run(
     say(f"model: {outputs.model}")
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
+    _end(result, in_train, held_out or in_train)
+
+
+def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
+    """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
+    for kind, one in judged.items():
+        if one.one.what == ERRORS and kind in in_train:
+            check_errors(result.model, one.one, in_train[kind].stages["geometry"].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 

@@ -185,7 +185,10 @@ class RegisteredMap(FittedMap):
     def joint_covariance(self, x: Tensor) -> Tensor:
         """That of the registration included, see :meth:`FittedMap.joint_covariance`."""
         points, at = self.geodesic.linearised_value(x)
-        at, found = at.projected(torch.eye(self.m).to(points).expand(len(x), -1, -1)), self.registration
+        at, found = (
+            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1)),
+            self.registration,
+        )
         S = self.place_slopes(x)
         cross = S @ (found.gain.to(S) @ self.fitted.covariance_between(self._rows, at))
         return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT

@@ -23,7 +23,7 @@ from diffeo_calib.reports.analysis.stages import (
     configurations,
     placed_stages,
 )
-from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 
 STEPS = 2
@@ -50,13 +50,29 @@ class KindFindings:
     deviations: Deviations
     parts: Sequence[Part]
 
-    rms_of = "expected of positions over the joint ranges of the fit"
+    @property
+    def judged(self) -> tuple[float, str]:
+        """The RMS error, m, that is compared with a tolerance, and of what it is.
+
+        Positions that the model has not seen decide. A spread or an error of readings is no accuracy, but the model is
+        not more accurate than these.
+        """
+        own = [list(stages.values())[-1] for stages in self.kinds.values()] if self.new else []
+        found = [(one.rms, f"of these rows ({one.label})") for one in own if one.unit == "m"]
+        if not any(one.what == ERRORS for one in own):
+            expected = self.deviations.error.whole
+            found.append((expected, "expected of positions over the joint ranges of the fit"))
+        return max(found)
 
     @property
     def rms(self) -> float:
-        """RMS error of positions that the model expects of itself, m."""
-        *_, own = self.expected.values()
-        return own
+        """See :attr:`judged`."""
+        return self.judged[0]
+
+    @property
+    def rms_of(self) -> str:
+        """What it is of, in words."""
+        return self.judged[1]
 
     @property
     def count(self) -> int:
