@@ -26,8 +26,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.placed import SESSION
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import SESSION, Places
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
