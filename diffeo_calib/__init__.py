@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
     from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+    from diffeo_calib.campaign.campaign import Campaign
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
     from diffeo_calib.fitting.fit import fit
     from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -61,6 +62,7 @@ __all__ = [
     "RK8",
     "CalibratedKinematics",
     "CalibrationResult",
+    "Campaign",
     "Cauchy",
     "Chain",
     "Comparison",
@@ -114,6 +116,7 @@ _MODULE_OF = {
     "RK8": "flows.integrators",
     "CalibratedKinematics": "kinematics.calibrated",
     "CalibrationResult": "calibration.calibrate",
+    "Campaign": "campaign.campaign",
     "Cauchy": "kernels.radial",
     "Chain": "robots.tree",
     "Comparison": "calibration.recalibration.compare",
@@ -163,6 +166,7 @@ _MODULE_OF = {
 """The module that defines each public name, as in the imports above."""
 _FOLDERS = (
     "calibration",
+    "campaign",
     "cli",
     "common",
     "fitting",

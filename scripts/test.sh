@@ -9,6 +9,5 @@ set -euo pipefail
 # shellcheck source=scripts/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 
-# Two processes; a file's tests stay together, and the longest files come first (tests/conftest.py).
 say "running the tests with $("$VENV/bin/python" --version)"
-exec "$VENV/bin/python" -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "" -rs --durations=10 "$@"
+exec "$VENV/bin/python" -m pytest -m "" -rs --durations=10 "$@"

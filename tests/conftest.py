@@ -7,14 +7,17 @@ and for the processes that tests start. Calibrations cost seconds, so files shar
 from __future__ import annotations
 
 import os
+import re
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 from pathlib import Path
+from typing import Any
 
 import pytest
-from command_bank import Command
+from command_bank import Command, leave_undrawn
+from kind_bank import KINDS
 from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot, with_usual_scales
 
 import diffeo_calib as dc
@@ -58,12 +61,21 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without pictures, for tests that look at their text and numbers."""
+    leave_undrawn(monkeypatch)
+
+
+@pytest.fixture
 def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     """`fit` in this process with the usual scales, for tests that do not look at their choice."""
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
+BY_KIND = ("test_matrix.py", "test_kinds_judged.py", "test_campaign.py")
+"""Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
+    *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
     *("test_outliers.py", "test_recalibrate_checks.py", "test_transforms.py", "test_rigid.py", "test_readme.py"),
     *("test_hidden_markers_whole.py", "test_registered_hardware.py", "test_plausibility.py", "test_json_results.py"),
@@ -73,6 +85,34 @@ LONGEST = (
     *("test_examples.py", "test_calibrated.py", "test_tools.py", "test_mixtures.py", "test_sessions.py"),
 )
 """File names, those of a quarter of a minute and more; all others follow in the usual order."""
+
+
+KIND = re.compile(rf"({'|'.join(BY_KIND)})::.*[-\[]({'|'.join(map(re.escape, KINDS))})\]$")
+
+
+def scope(test: str) -> str:
+    """What runs in one process: the tests of a file, or those of a kind."""
+    found = KIND.search(test)
+    return found[2] if found else test.partition("::")[0]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """``--dist loadfile``, but for the files of :data:`BY_KIND`."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByKind(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return scope(nodeid)
+
+    return ByKind(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A process for each processor, at most 4, for the whole suite; for files and folders named, this one."""
+    whole = [Path(argument).resolve() for argument in config.args] == [Path(__file__).parent]
+    return min(4, os.cpu_count() or 1) if whole else 0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

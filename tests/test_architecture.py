@@ -45,6 +45,7 @@ FLOORS = (
     ("calibration.diagnostics", "measurements that cannot be right"),
     ("calibration", "the calibration of a robot"),
     ("calibration.planning", "poses to measure"),
+    ("campaign", "rows judged as they come"),
     # faces
     ("interop", "model files"),
     ("reports", "analysis, plots, HTML pages"),
@@ -57,7 +58,7 @@ STRANGERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(MATHEMATICS, ROBOTS), *
 EXCEPTIONS = {("fitting.fit", "paper.eulerian"): 'fit(formulation="eulerian") reaches up, inside a function'}
 IN_THE_ROOT = {"__init__.py", "__main__.py", "py.typed"}
 
-MOST_PUBLIC_NAMES = 50
+MOST_PUBLIC_NAMES = 51
 
 PACKAGE = Path(diffeo_calib.__file__).parent
 LEVEL = {name: level for level, (name, _) in enumerate(FLOORS)}

@@ -18,6 +18,7 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.name.startswith("diffeo_calib.")]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     arm, train, test = simulated(30)
     points = train.points.clone()

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 import torch
-from command_bank import Command, Outcome
+from command_bank import Command, Outcome, leave_undrawn
 from kind_bank import KINDS, POSITIONED, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
 from torch.testing import assert_close
 
@@ -184,6 +184,7 @@ def _(bench: Bench) -> None:
 @verb("fit --report")
 def _(bench: Bench) -> None:
     path = bench.folder / "report.html"
+    leave_undrawn(bench.command.monkeypatch)  # "report" draws them
     bench.fit("--report", path)
     assert "<svg" in path.read_text(encoding="utf-8")
 
@@ -293,6 +294,7 @@ def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "report.html"
     dc.write_report(kind.model, path)
     assert "<svg" in path.read_text(encoding="utf-8")
+    leave_undrawn(bench.command.monkeypatch)  # tests/cli/test_kinds_judged.py draws those of new rows
     table, options = kind.table("new")
     bench.run("report", kind.file, "-o", path, "--data", table, *options)
     assert "<svg" in path.read_text(encoding="utf-8")

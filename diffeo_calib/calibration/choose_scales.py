@@ -111,7 +111,7 @@ def choose_scales(
     if given is not None:
         return _given(given, data, seed)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
-    centre = defaults(data, _noise(data, poses, registration, identification), identification.prior)
+    centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
     if poses < LIMITS.fewest_poses:
         found = _defaults_of_few(centre, poses, len(measurements))
     else:
@@ -186,7 +186,7 @@ def _inflation(
     return inflation or factor, replace(found, interrupted=inflation is None)
 
 
-def _noise(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
+def noise_of_few(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
     """Noise of the geometric calibration; of the registration where geometry can fit the data exactly, m."""
     if poses * data.coordinates / len(data.x) > data.nominal.geometry.size:
         return identification.noise

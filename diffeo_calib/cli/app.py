@@ -51,10 +51,13 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
+        options_of_fit, of_campaign = (
+            [option.removeprefix("--") for one in self.commands[name].params for option in one.opts]
+            for name in (campaign.COMMAND, campaign.LIVE)
+        )
         if (several := campaign.asked(args, options_of_fit)) is not None:
             raise typer.Exit(campaign.run(several))
-        _arguments[:] = campaign.expanded(args, options_of_fit)
+        _arguments[:] = campaign.expanded(args, options_of_fit, of_campaign)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)

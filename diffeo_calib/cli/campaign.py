@@ -32,8 +32,8 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 SUFFIX = ".toml"
-COMMAND = "fit"
-PATHS = ("csv", "robot", "output", "figure", "report", "json")
+COMMAND, LIVE = "fit", "campaign"
+PATHS = ("csv", "robot", "output", "figure", "report", "json", "candidates", "accepted")
 """Entries that name files."""
 REPEATED = ("position", "tip", "load", "distance", "rotation", "reading")
 """Entries that may be lists: one option for each value."""
@@ -41,25 +41,30 @@ LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
 
 
-def expanded(arguments: Sequence[str], known: Sequence[str]) -> list[str]:
+def expanded(arguments: Sequence[str], known: Sequence[str], live: Sequence[str] = ()) -> list[str]:
     """The same command line with a campaign file written out; unchanged without one.
 
     Args:
         arguments: of the program. known: names of the options of `fit`, without dashes.
+        live: the same of `campaign`, which leaves out entries of `fit` alone.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or has an entry that is no option.
     """
     words = list(arguments)
     at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
-    if len(words) < at + 2 or words[at] != COMMAND or not words[at + 1].lower().endswith(SUFFIX):
+    if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):
         return words
     path = Path(words[at + 1])
     entries = _read(path)
+    if words[at] == LIVE:
+        only_of_fit = {*known} - {*live}
+        entries = {name: value for name, value in entries.items() if name.replace("_", "-") not in only_of_fit}
+        known = live
     names = [name.replace("_", "-") for name in entries]
     unknown = [name for name in names if name not in (*known, "csv")]
     if unknown:
-        expected = f"options of `fit`: csv, {', '.join(known)}"
+        expected = f"options of `{words[at]}`: csv, {', '.join(known)}"
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")
     if "csv" not in names:
         raise InputError.of(f"{path} has no entry csv", fix='add csv = "measurements.csv", the table to calibrate with')

@@ -54,6 +54,28 @@ def fit_command(
     fit.run(links, measured_table(csv, rows, units, duplicates), files, **how)
 
 
+@command("campaign")
+def campaign_command(
+    csv: options.CsvPath,
+    robot: options.Robot,
+    units: options.Units,
+    rows: options.Rows,
+    given: options.LiveOptions,
+) -> None:
+    """Judge rows while they are measured.
+
+    Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and the
+    best poses to measure next. A journal beside the table keeps what was decided: after a crash the same command goes
+    on where it stopped. Ends with exit code 0 when --target is reached, 4 if the rows end before.
+    """
+    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot})
+    from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
+    from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
+
+    links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
+    campaign.run(links, measured_table(csv, rows, units), given)
+
+
 @command("evaluate")
 def evaluate_command(
     model: options.ModelPath,

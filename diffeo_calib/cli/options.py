@@ -270,6 +270,20 @@ class FitOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How to follow a campaign."""
+
+    target: str | None = option("End when the expected error is at most this, with its unit: 0.15mm.", "LENGTH")
+    stdin: bool = option(
+        "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
+    )
+    once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
+    candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
+    next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
+    accepted: Path | None = option("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
     """What to do with the errors of a model."""
 

@@ -54,11 +54,11 @@ def test_time_steps_have_their_order(data: Landmarks) -> None:
 @pytest.mark.slow
 def test_the_program_measures_in_processes() -> None:
     plan = Namespace(devices=["cpu"], dims=[2], tasks=["sum", "loss_and_gradient"], sizes=[64], repeats=2, quick=True)
-    plan.backends = ["tiled", "tiled_unpooled", "dense_autograd", "naive_dense"]
+    plan.backends = ["tiled", "naive_dense"]
     records = list(lazy_vs_dense.measure(plan))
     assert [(record["task"], record["backend"]) for record in records] == [
         *(("sum", backend) for backend in plan.backends),
-        *(("loss_and_gradient", backend) for backend in plan.backends[:3]),
+        ("loss_and_gradient", "tiled"),
     ]
     for record in records:
         assert record["failure"] is None

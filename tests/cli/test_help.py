@@ -26,6 +26,10 @@ OPTIONS = {
             "--jobs",
         ),
     ],
+    "campaign": [
+        *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session"),
+        *("--payload", "--target", "--stdin", "--once", "--candidates", "--next", "--accepted"),
+    ],
     "evaluate": [
         *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),
         *JUDGED,

@@ -65,6 +65,7 @@ def test_evaluate(folder: Path, command: Command, arm: Case) -> None:
     assert set(same["results"]["errors"]) == {"all", "used_in_the_fit"} or "all" in same["results"]["errors"]
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.slow
 def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
     model = "arm.safetensors"
@@ -95,7 +96,7 @@ def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Comma
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
+@pytest.mark.usefixtures("given_scales", "undrawn")
 def test_fit(folder: Path, command: Command) -> None:
     written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
     assert set(written["errors"]) == {"training", "held_out"}

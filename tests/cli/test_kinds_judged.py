@@ -94,12 +94,6 @@ def test_evaluate_command(kind: Kind, command: Command, tmp_path: Path) -> None:
     assert expected in " ".join(done.out.split())
 
 
-def test_new_rows_above_a_limit(kind: Kind, command: Command) -> None:
-    csv_file, given = kind.table()
-    done = command("evaluate", kind.file, csv_file, *given, "--fail-above", "0.1um")
-    assert done.code == 4, done.err
-
-
 def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path) -> None:
     """Every kind has its page; errors of each kind by stage, in its unit."""
     path = tmp_path / "page.html"
@@ -114,6 +108,7 @@ def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path) -> None:
         assert "RMS [px]" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_report_command(kind: Kind, command: Command, tmp_path: Path) -> None:
     page = tmp_path / "r.json"
     csv_file, given = kind.table()

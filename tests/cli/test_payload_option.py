@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.usefixtures("given_scales")
+@pytest.mark.usefixtures("given_scales", "undrawn")
 def test_fit_takes_the_column(folder: Path, tmp_path: Path, command: Command) -> None:
     robot = ("--robot", folder / "arm.urdf", "--base", "base_link", "--tip", "flange")
     files = ("-o", tmp_path / "m.safetensors", "--report", tmp_path / "r.html")

@@ -44,6 +44,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
             "diffeo-calib ",
             [
                 "fit",
+                "campaign",
                 "evaluate",
                 "init",
                 "images",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.cameras.lens import LENS
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
@@ -96,6 +96,13 @@ class LensAndBoard(DeviceSet):
         known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
         camera = replace(self.camera, unknowns=self.camera.unknowns + change, root=root)
         return replace(self, camera=camera, explained=replace(self.explained, **known))
+
+    def with_rows(self, other: OtherRows) -> LensAndBoard:
+        """See :class:`DeviceSet`."""
+        if other.coordinates is None:
+            raise MeasurementError.of("rows of a camera", expected="images", got="none")
+        ((camera, slopes, _),) = other.coordinates.table.shared_errors()
+        return replace(self, camera=camera, slopes=slopes, rows=other.coordinates.rows)
 
     def _at_tool(self, errors: Tensor, part: slice) -> float:
         """RMS distance, m, of points by some of the lens' and board's errors (14,) or (14, c), summed in squares."""

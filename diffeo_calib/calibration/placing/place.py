@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import Placement, seen_rows
+from diffeo_calib.calibration.placing.placement import OtherRows, Placement, seen_rows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -33,6 +33,7 @@ from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -213,6 +214,32 @@ class Placed:
         held = held_parameters(geometry) if self.free else ()
         seen = seen_rows(data)
         return replace(data, shared=self.placement.shared(seen), held=held)
+
+    def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
+        """Other rows of the same devices, and around the same linearisation with all weights 1.
+
+        Args:
+            data: rows of every kind of the calibration. like: the rows of the calibration.
+
+        Raises:
+            MeasurementError: rows of another device.
+        """
+        coordinates, readings = divided(data)
+        centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
+        other = OtherRows(coordinates, readings, len(data), centre)
+        placement = Placement(tuple(one.with_rows(other) for one in self.placement))
+        if coordinates is not None:
+            table = placement.aligned(coordinates.table)
+            for one in placement:
+                table = one.at_places(table)
+            coordinates = coordinates._replace(table=table)
+        count = len(data if coordinates is None else coordinates.rows)
+        tails = Tails.none(count, self.identification.tails.weights.shape[1])
+        found = replace(self.identification, tails=tails)
+        own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
+        rows = own._rows(like.nominal.under(data.payload), like.theta)
+        rows = replace(rows, held=like.held)
+        return own, replace(rows, shared=placement.shared(seen_rows(rows)))
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""

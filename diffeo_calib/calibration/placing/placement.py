@@ -26,6 +26,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
 from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
 T = TypeVar("T")
@@ -49,6 +50,20 @@ class SeenRows(NamedTuple):
 def seen_rows(data: Any) -> SeenRows:
     """These parts of a tangent model."""
     return SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
+
+
+class OtherRows(NamedTuple):
+    """Rows of devices that are known, as they were measured.
+
+    Args:
+        coordinates: those that tell coordinates. readings: the others, by kind. count: of all.
+        centre: (3,) the middle of the rows with which the devices were found, m.
+    """
+
+    coordinates: Coordinates | None
+    readings: list[OtherReadings]
+    count: int
+    centre: Tensor
 
 
 class Settled(NamedTuple):
@@ -88,6 +103,10 @@ class DeviceSet(ABC):
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+
+    @abstractmethod
+    def with_rows(self: S, other: OtherRows) -> S:
+        """The same devices with other rows in place of their own; MeasurementError for other devices."""
 
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model."""

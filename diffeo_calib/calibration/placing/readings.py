@@ -26,7 +26,7 @@ from diffeo_calib.calibration.identification.identification import (
     least_squares_of,
     weighed_fits,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
@@ -37,6 +37,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import sensor_key
 from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
@@ -106,6 +107,12 @@ class ReadingDevices(DeviceSet):
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
         known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
         return replace(self, devices=moved, known=known)
+
+    def with_rows(self, other: OtherRows) -> ReadingDevices:
+        """See :class:`DeviceSet`."""
+        own = next(one for one in other.readings if sensor_key(one.table) == sensor_key(self.data))
+        self.devices.numbers(own.table)  # refuses other devices
+        return replace(self, data=own.table, rows=own.rows)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.fitting.result import Progress
@@ -30,7 +30,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.placed import SESSION, PlacedDevices
 from diffeo_calib.sensors.places import check_rows_of_sessions, robust_fit
-from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.tables import Coordinates, measured_rows
 
 ROUNDS = 3
 
@@ -45,6 +45,7 @@ class SessionFrames(DeviceSet):
         transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
         session: (N,) number of the session of each row of a calibration, -1 for rows of none.
         markers: P that a device saw, the first ones of the geometry.
+        centre: (3,) about which frames turn, m; by default the middle of the rows.
     """
 
     names: tuple[str, ...]
@@ -52,6 +53,7 @@ class SessionFrames(DeviceSet):
     transforms: Tensor
     session: Tensor
     markers: int
+    centre: Tensor | None = None
 
     @classmethod
     def of_table(
@@ -123,13 +125,7 @@ class SessionFrames(DeviceSet):
         Raises:
             MeasurementError: a session that is not known.
         """
-        own, names = _sessions(data)
-        unknown = [name for name in names if name not in self.names]
-        if unknown:
-            fix = "register the model with rows of the new set-up"
-            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
-        return data.in_frames(torch.linalg.inv(self.transforms)[numbers])
+        return data.in_frames(torch.linalg.inv(self.transforms)[self.numbers(data)])
 
     def groups(self) -> list[tuple[str, Tensor]]:
         """See :class:`DeviceSet`."""
@@ -148,12 +144,30 @@ class SessionFrames(DeviceSet):
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
         places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
-        frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)))
+        frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)) if self.centre is None else self.centre)
         frame = frame if data.slopes is None else data.slopes @ frame
         markers = slice(tool.start, tool.start + 3 * self.markers)
         effects = torch.cat([frame, PLACES.remounted_m * data.sensitivities[..., markers]], dim=2)
         session = self.session.to(effects.device)
         return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
+
+    def with_rows(self, other: OtherRows) -> SessionFrames:
+        """See :class:`DeviceSet`."""
+        session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        device = None if other.coordinates is None else measured_rows(other.coordinates.table)
+        if other.coordinates is not None and device is not None:
+            session[other.coordinates.rows[device.rows]] = self.numbers(device.table)
+        return replace(self, session=session, centre=other.centre)
+
+    def numbers(self, data: Any) -> Tensor:
+        """(N,) number here of each row's session; MeasurementError for a session that is not known."""
+        own, names = _sessions(data)
+        unknown = [names[number] for number in own.unique().tolist() if names[number] not in self.names]
+        if unknown:
+            fix = "register the model with rows of the new set-up"
+            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
+        known = [self.names.index(name) if name in self.names else NO_SOCKET for name in names]
+        return torch.tensor(known, dtype=torch.int64, device=HOST)[own]
 
     def settled(self, found: Settled) -> SessionFrames:
         """See :class:`DeviceSet`."""

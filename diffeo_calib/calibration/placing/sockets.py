@@ -33,10 +33,10 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -176,7 +176,7 @@ class SocketDevices(DeviceSet):
 
     def at_places(self, table: Measurements) -> Measurements:
         """See :class:`DeviceSet`."""
-        return self.places.placed(table)
+        return self.places.placed(self.named(table))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -224,6 +224,23 @@ class SocketDevices(DeviceSet):
             left_out=self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
         )
+
+    def with_rows(self, other: OtherRows) -> SocketDevices:
+        """See :class:`DeviceSet`."""
+        socket = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        if other.coordinates is not None:
+            table = self.named(other.coordinates.table)
+            socket[other.coordinates.rows] = table.socket_numbers
+        return replace(self, socket=socket)
+
+    def named(self, table: Measurements) -> Measurements:
+        """The rows of a table with these sockets; MeasurementError for others."""
+        unknown = sorted(set(table.row_sockets) - {*self.names, ""})
+        if unknown:
+            raise MeasurementError.of("rows in sockets", expected=few(self.names), got=few(unknown))
+        numbers = {name: number for number, name in enumerate(self.names)} | {"": NO_SOCKET}
+        own = torch.tensor([numbers[name] for name in table.row_sockets], dtype=torch.int64, device=HOST)
+        return with_attributes(table, socket=own, sockets=self.places.sockets)
 
     def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
         """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.

@@ -1,0 +1,1 @@
+"""Campaigns that watch themselves: every row is judged as it comes, before it is taken in."""

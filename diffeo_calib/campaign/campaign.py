@@ -1,0 +1,243 @@
+"""`Campaign`: rows are judged as they come, and the campaign says how accurate the robot is and what to measure next.
+
+A model of the accepted rows (model.py) is renewed as they grow by a quarter: registration and geometry; its scales at
+20, 40, 80, ... rows. In between the posterior takes in one row at a time. The last rows are kept apart from it: what
+has changed among them shows a few rows later, and those that were taken in since then are taken out again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from threading import Thread
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.calibrate import Table, calibrate, check_arguments
+from diffeo_calib.calibration.planning.candidates import candidates as drawn
+from diffeo_calib.calibration.result import CalibrationResult
+from diffeo_calib.campaign.model import CampaignModel
+from diffeo_calib.campaign.planned import Next, planned
+from diffeo_calib.campaign.verdicts import Verdict
+from diffeo_calib.common.checks import check_seed
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import DiffeoCalibError, InputError
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.common.threads import small_work
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.tree import Tree
+
+FIRST_ROWS = 12
+"""Accepted rows of the first model."""
+GROWTH = 1.5
+"""Factor by which the accepted rows grow between two models."""
+FIRST_SCALES = 20
+"""Accepted rows at which scales are selected first; then at twice as many."""
+CANDIDATES, TARGETS = 120, 40
+"""Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
+
+
+@methods_outside_inference_mode
+class Campaign:
+    """A measurement campaign that judges every row before it is taken in.
+
+    Args:
+        robot: nominal chain, n joints.
+        candidates: (M, n) configurations that can be measured, rad or m; drawn within the joint limits by default.
+        target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
+        background: whether models are renewed in a thread of their own: a call then never waits for one, and verdicts
+            depend on when it ends. By default a call that is due for a new model makes it (some seconds).
+        seed: of everything that is drawn.
+
+    Attributes:
+        table: all rows so far, in order; None before the first. verdicts: one for each of them, the latest view.
+        models: how many were made.
+
+    Raises:
+        InputError: arguments of the wrong kind.
+    """
+
+    def __init__(
+        self,
+        robot: Tree,
+        *,
+        candidates: object = None,
+        target: object = None,
+        background: bool = False,
+        seed: int = 0,
+    ) -> None:
+        if not isinstance(robot, Tree):
+            raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__)
+        self.robot, self.seed, self.background = robot, check_seed(seed), background
+        self.candidates = drawn(robot, CANDIDATES, seed=seed) if candidates is None else _joints(robot, candidates)
+        self.target = self.candidates if target is None else _joints(robot, target)
+        self.table: Any = None
+        self.verdicts: list[Verdict] = []
+        self.models = 0
+        self._model: CampaignModel | None = None
+        self._made: list[CampaignModel] = []
+        self._maker: Thread | None = None
+        self._tried = 0
+
+    def __len__(self) -> int:
+        return len(self.verdicts)
+
+    def __repr__(self) -> str:
+        known = self.expected_error
+        words = "" if known is None else f", {1e3 * known:.3g} mm expected"
+        return f"Campaign({len(self.accepted)} of {len(self)} rows accepted{words})"
+
+    @property
+    def accepted(self) -> list[int]:
+        """Numbers of the accepted rows."""
+        return [one.row for one in self.verdicts if one.accepted]
+
+    @property
+    def expected_error(self) -> float | None:
+        """RMS error of the robot over the target as the accepted rows lead to expect, m; None before a first model."""
+        return None if self._model is None else self._model.expected_error
+
+    @small_work()
+    def add(self, q_or_table: object, y: object = None) -> list[Verdict]:
+        """Judge rows, one after the other, and take in those that fit.
+
+        Args:
+            q_or_table: rows of any kind that :func:`calibrate` takes; or joint values (N, n) or (n,), rad or m.
+            y: with joint values, the measured positions (N, P, 3), (N, 3) or (3,), m.
+
+        Returns:
+            a :class:`Verdict` for every row. Rows that look wrong are kept but not accepted, see :meth:`accept`.
+
+        Raises:
+            InputError, MeasurementError: rows of another kind, or of other joints than those before.
+        """
+        table = q_or_table if y is None else _positions(q_or_table, y)
+        check_arguments(self.robot, table, None)
+        start = len(self)
+        numbered: Any = table
+        numbered = numbered.with_line_numbers(torch.arange(start, start + len(numbered), device=HOST))
+        whole = numbered if self.table is None else joined_tables([self.table, numbered])
+        for row in range(start, len(whole)):
+            self.table = whole.rows(slice(0, row + 1))
+            self._add(row)
+        return self.verdicts[start:]
+
+    @small_work()
+    def resume(self, table: Table, verdicts: Sequence[Verdict]) -> None:
+        """Go on with rows that an earlier campaign judged; InputError unless there is one verdict for each of them."""
+        check_arguments(self.robot, table, None)
+        if len(self) or len(table) != len(verdicts):
+            raise InputError.of("`verdicts`", expected=f"{len(table)}, of a new campaign", got=str(len(verdicts)))
+        rows: Any = table
+        self.table = rows.with_line_numbers(torch.arange(len(rows), device=HOST))
+        self.verdicts = list(verdicts)
+        self._renew()
+
+    def accept(self, row: int) -> None:
+        """Take a row in, whatever its verdict."""
+        self._decide(row, accepted=True)
+
+    def reject(self, row: int) -> None:
+        """Leave a row out, whatever its verdict."""
+        self._decide(row, accepted=False)
+
+    def rows(self) -> Table:
+        """The accepted rows; InputError if there are none."""
+        if not self.accepted:
+            raise InputError.of("the accepted rows", expected="at least one", got="none")
+        return self.table.rows(self.accepted)
+
+    def result(self, **options: Any) -> CalibrationResult:
+        """:func:`calibrate` of the accepted rows; ``options`` are its own."""
+        return calibrate(self.robot, self.rows(), **options)
+
+    @small_work()
+    def next(self, count: int = 5, goal: float | None = None) -> Next | None:
+        """The poses that help most, greedily, and how many more rows an expected error takes; None before a model.
+
+        Args:
+            count: of poses. goal: expected error to reach, m.
+        """
+        return None if self._model is None else planned(self._model, count, goal)
+
+    def wait(self) -> None:
+        """Wait for a model that is made in the background."""
+        if self._maker is not None:
+            self._maker.join()
+        self._collect()
+
+    def _add(self, row: int) -> None:
+        """Judge one row of the table, and renew the model if it is due."""
+        self._collect()
+        if self._model is None:
+            self.verdicts.append(Verdict(row, None, accepted=True))
+        else:
+            try:
+                self._model.judge(self.table, self.verdicts)
+            except DiffeoCalibError as error:  # a device that has no place yet
+                self.verdicts.append(Verdict(row, None, accepted=True, cause=str(error)))
+        self._renew()
+        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
+
+    def _decide(self, row: int, *, accepted: bool) -> None:
+        if row not in range(len(self)):
+            raise InputError.of("`row`", expected=f"0 to {len(self) - 1}", got=str(row))
+        if self.verdicts[row].accepted != accepted:
+            self.verdicts[row] = replace(self.verdicts[row], accepted=accepted, decided=True)
+            self.wait()
+            if self._model is not None:
+                self._model = self._model.rebuilt(self.table, self.verdicts)
+
+    def _renew(self) -> None:
+        """Make a new model if it is due."""
+        count, model = len(self.accepted), self._model
+        due = FIRST_ROWS if model is None else min(GROWTH * model.count, model.next_scales)
+        if count < due or count == self._tried or self._maker is not None:
+            return
+        self._tried = count
+        arguments = self.table, list(self.verdicts)
+        if self.background:
+            self._maker = Thread(target=self._make, args=arguments, daemon=True)
+            self._maker.start()
+        else:
+            self._make(*arguments)
+            self._collect()
+
+    @small_work()
+    def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
+        """A new model from accepted rows; without one if they do not allow it yet."""
+        count, old = sum(one.accepted for one in verdicts), self._model
+        scales = None if old is None or count >= old.next_scales else old.scales
+        first = count < FIRST_SCALES
+        asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
+        try:
+            made = CampaignModel.of(self.robot, table, verdicts, asked, (scales, first, self.seed))
+        except DiffeoCalibError:
+            return
+        if old is not None and scales is not None:
+            made.ratios = list(old.ratios)  # else new scales have yet to show how good they are
+        self.models += 1
+        self._made.append(made)
+
+    def _collect(self) -> None:
+        """Put a new model in the place of the old one."""
+        if self._maker is not None and not self._maker.is_alive():
+            self._maker = None
+        if self._made:
+            made = self._made.pop()
+            self._model = made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
+
+
+def _positions(q: object, y: object) -> Measurements:
+    """Positions of one row or of several."""
+    joints, points = (torch.as_tensor(value, dtype=torch.float64, device=HOST) for value in (q, y))
+    if joints.ndim == 1:
+        joints, points = joints[None], points[None]
+    return Measurements(joints, points, doubt=False)
+
+
+def _joints(robot: Tree, values: object) -> Tensor:
+    return robot.joint_values(values).detach()  # pyright: ignore[reportArgumentType]

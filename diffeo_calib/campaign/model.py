@@ -1,0 +1,303 @@
+"""What a campaign knows at one time: places, scales and the posterior of its accepted rows, and the last rows."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import pi
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
+from diffeo_calib.calibration.placing.place import Placed, place
+from diffeo_calib.calibration.placing.placement import seen_rows
+from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
+from diffeo_calib.campaign.verdicts import LIMITS, Change, Verdict, exchanged, find_change, measure
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
+from diffeo_calib.fitting.result import silent
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.measurements.bodies import origins
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.tables import rows_of_one_kind
+
+MOST_COORDINATES = 4500
+"""Measured numbers of a posterior: of more rows a random sample stands for all."""
+UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: m as mm?"))
+
+
+class Around(NamedTuple):
+    """Rows around the places of a model, what may change of their devices, and (N,) where they are among these."""
+
+    data: TangentData
+    devices: Callable[[], list[Cause]]
+    index: Tensor
+
+    def causes(self) -> list[Cause]:
+        """What may change of robot, tool and devices."""
+        devices = [one._replace(effects=one.effects[self.index]) for one in self.devices()]
+        return [one for one in (*causes_of(self.data), *devices) if bool((one.effects != 0).any())]
+
+
+@dataclass(eq=False)
+class CampaignModel:
+    """Places and scales of some accepted rows, and the posterior of all of them but the last.
+
+    Args:
+        placed: geometry and devices. data: the rows they were found with. scales: of the model.
+        next_scales: number of accepted rows at which scales are selected again. count: accepted rows of this model.
+        seen: rows of the campaign at that time. asked: candidates (M, n) and target (T, n), rad or m.
+        posterior: of the accepted rows but the last ones. window: numbers of the last rows.
+        last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
+        compared: see :func:`_compared`. ratios: of the squares of accepted rows, see :attr:`Measure.ratio`.
+    """
+
+    placed: Placed
+    data: TangentData
+    scales: Hyperparameters
+    next_scales: int
+    count: int
+    seen: int
+    asked: tuple[Tensor, Tensor]
+    posterior: Posterior
+    window: list[int]
+    last: Seen
+    taken: Tensor
+    compared: Tensor
+    ratios: list[float]
+
+    @classmethod
+    def of(
+        cls,
+        robot: Tree,
+        table: Any,
+        verdicts: Sequence[Verdict],
+        asked: tuple[Tensor, Tensor],
+        choice: tuple[Hyperparameters | None, bool, int],
+    ) -> CampaignModel:
+        """A model of the accepted rows.
+
+        Args:
+            choice: scales, None to select them; whether the rows are too few for that; a seed.
+
+        Raises:
+            DiffeoCalibError: rows that do not allow a model yet.
+        """
+        scales, first, seed = choice
+        numbers = [one.row for one in verdicts if one.accepted]
+        rows = table.rows(numbers)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
+            placed = place(robot, rows, silent)
+            data, stages = placed.tangent_data(), (placed.registration, placed.identification)
+            if scales is None and first:
+                scales = defaults(data, noise_of_few(data, len(numbers), *stages), placed.identification.prior)
+            if scales is not None:
+                scales = replace(scales, lines=())
+            chosen = choose_scales(data, rows, *stages, given=scales, seed=seed)
+        scales, data = chosen.selection.scales, chosen.data
+        next_scales = 20
+        while next_scales <= len(numbers):
+            next_scales *= 2
+        later: Any = None
+        counts = next_scales, len(numbers), len(table)
+        bare = cls(placed, data, scales, *counts, asked, later, [], later, later, later, [])
+        return bare.rebuilt(table, verdicts)
+
+    def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
+        """The same places and scales with the posterior of the rows that are accepted now."""
+        accepted = [one.row for one in verdicts if one.accepted]
+        first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
+        window = [one.row for one in verdicts[-LIMITS.window :] if one.row >= first]
+        old = [row for row in accepted if row not in window]
+        known = self.placed.data.line_numbers.tolist()
+        place_of = {row: number for number, row in enumerate(known)}
+        mine = torch.tensor([place_of[row] for row in old if row in place_of], dtype=torch.int64, device=HOST)
+        _, some = self.data.rows(mine).sample(len(mine), MOST_COORDINATES, 0)
+        rows = Rows.of(some, self.scales)
+        later = [row for row in old if row not in place_of]
+        if later:
+            rows = Rows.joined(rows, Rows.of(self.around(table, later).data, self.scales))
+        asked = self._asked(table)
+        posterior = Posterior(rows, asked)
+        last = posterior.see(Rows.of(self.around(table, window).data, self.scales))
+        taken = _flags([verdicts[row].accepted for row in window])
+        own = {"posterior": posterior, "window": window, "last": last, "taken": taken, "ratios": list(self.ratios)}
+        return replace(self, **own, seen=len(table), compared=_compared(self.placed, asked[0]))
+
+    @property
+    def expected_error(self) -> float:
+        """RMS error over the target, m, of the markers, or of the origins of poses."""
+        J = self.compared
+        return float((3 * ((J @ self.known(J.shape[1])) * J).sum(1).mean()).clamp(min=0).sqrt())
+
+    def known(self, size: int | None = None) -> Tensor:
+        """Covariance of the target and then of the candidates by all accepted rows, the first ``size`` numbers, m^2."""
+        whole, mine = self.posterior.known[:size, :size], self.taken[self.last.rows.owner]
+        cross = self.posterior.between(self.last)[mine, :size]
+        return whole - cross.T @ torch.linalg.solve(self.last.covariance[mine][:, mine], cross)
+
+    def judge(self, table: Any, verdicts: list[Verdict]) -> None:
+        """Judge the last row of a table, add its verdict, and take in the row that leaves the window.
+
+        Raises:
+            MeasurementError: a device that is not known.
+        """
+        row = len(table) - 1
+        self.window.append(row)
+        try:
+            around = self.around(table, self.window)
+        except DiffeoCalibError:
+            self.window.pop()
+            raise
+        rows, last = Rows.of(around.data, self.scales), len(self.window) - 1
+        new = self.posterior.see(rows.rows(torch.tensor([last], dtype=torch.int64, device=HOST)))
+        seen = self.posterior.see(rows, torch.cat([self.last.white, new.white], 1))
+        known = _flags([*(verdicts[number].accepted for number in self.window[:-1]), False])
+        found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
+        fits = found.fits(typical)
+        if fits:
+            self.ratios.append(found.ratio)
+        cause = "" if fits else self._cause(table, around.data, seen, known)
+        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause))
+        change = None if cause else self._change(around, seen, verdicts, typical)
+        if change is not None:
+            for number in self.window:
+                own, before = verdicts[number], number < change.row
+                if own.change is not None or not (before or own.cause or own.decided):
+                    accepted = before and bool(own.fits)
+                    verdicts[number] = replace(own, accepted=accepted, change=None if before else change)
+        self._move_on(seen, verdicts)
+
+    @property
+    def typical(self) -> float:
+        """How large right squares are relative to those by chance: at least one."""
+        last = sorted(self.ratios[-LIMITS.typical_rows :])
+        if len(last) < LIMITS.fewest_typical:
+            return LIMITS.at_first
+        return max(1.0, last[int(LIMITS.typical_share * len(last))])
+
+    def _move_on(self, seen: Seen, verdicts: Sequence[Verdict]) -> None:
+        """Take the first row of a full window into the posterior, if it was accepted."""
+        self.taken = _flags([verdicts[row].accepted for row in self.window])
+        self.last = seen
+        if len(self.window) <= LIMITS.window:
+            return
+        owner, index = seen.rows.owner, torch.arange(len(seen.rows), device=HOST)
+        row, self.last = (
+            Seen(seen.rows.rows(some), seen.white[:, mine], seen.error[mine], seen.covariance[mine][:, mine])
+            for some, mine in ((index[:1], owner == 0), (index[1:], owner > 0))
+        )
+        if bool(self.taken[0]):
+            self.last = self.posterior.see(self.last.rows, self.posterior.take(row, self.last))
+        self.window, self.taken = self.window[1:], self.taken[1:]
+
+    def _change(self, around: Around, seen: Seen, verdicts: Sequence[Verdict], typical: float) -> Change | None:
+        """What changed among the last rows."""
+        own = [verdicts[number] for number in self.window]
+        known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
+        return find_change(seen, self.window, around.causes(), (known, doubted), typical=typical)
+
+    def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
+        """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
+        row, last, freedom = self.window[-1], len(known) - 1, _freedom(data, len(known) - 1)
+        mine, visible = seen.rows.owner == last, data.visible[last]
+
+        def fits(other: Seen, some: Tensor | None = None, freedom: int = freedom) -> bool:
+            return measure(other, last, known, freedom, some).fits(self.typical, LIMITS.undone)
+
+        y = data.y[last : last + 1]
+        bodies = data.noise_model.bodies
+        undone = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
+        for words, other in [*undone, *exchanged(y, bodies)]:
+            error = seen.error.clone()
+            error[mine] += (other - y)[0, visible]
+            if fits(seen._replace(error=error)):
+                return words
+        for words, other in self._other_joints(table, row, seen):
+            if fits(other):
+                return words
+        size = len(visible) // bodies
+        body = (seen.rows.visible.nonzero()[:, 1] // size).masked_fill(~mine, -1)
+        good = [b for b in range(bodies) if fits(seen, mine & (body != b), freedom * (bodies - 1) // bodies)]
+        return f"marker {good[0]} seems to be wrong" if len(good) == 1 < bodies else ""
+
+    def _other_joints(self, table: Any, row: int, seen: Seen) -> Iterator[tuple[str, Seen]]:
+        """The last rows with other joint values of the last one, in words."""
+        turning = torch.tensor(self.placed.registration.geometry.chain.periodic, dtype=torch.bool, device=HOST)
+        q = table.q[row]
+        readings = (
+            ("its joint values seem to be degrees as radians", torch.where(turning, q * pi / 180, q)),
+            ("its joint values seem to be converted to radians twice", torch.where(turning, q * 180 / pi, q)),
+            ("it seems to have been measured at the joint values of the row before", table.q[row - 1]),
+        )
+        before = torch.arange(len(seen.rows) - 1, device=HOST)
+        white = seen.white[:, seen.rows.owner < len(before)]
+        for words, joints in readings:
+            new = self.posterior.see(Rows.of(self.around(table, [row], joints[None]).data, self.scales))
+            rows = Rows.joined(seen.rows.rows(before), new.rows)
+            yield words, self.posterior.see(rows, torch.cat([white, new.white], 1))
+
+    def around(self, table: Any, numbers: Sequence[int], joints: Tensor | None = None) -> Around:
+        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know.
+
+        Args:
+            joints: (N, n) in place of theirs.
+        """
+        known = self.placed.data
+        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
+        others = table.rows(list(numbers))
+        whole = joined_tables([anchors, others if joints is None else with_joints(others, joints)])
+        placed, data = self.placed.beside(whole, self.data)
+        index = torch.arange(len(anchors), len(whole), device=HOST)
+        return Around(data.rows(index), lambda: placed.placement.changes(seen_rows(data)), index)
+
+    def _asked(self, table: Any) -> tuple[Rows, Rows]:
+        """The target, and the candidates as if they were measured like the last row."""
+        candidates, target = self.asked
+        nominal = self.data.nominal.typical
+        like = replace(self.data, nominal=nominal, x=target, shared=None, observe=None, beside=None)
+        at = like.linearisation(self.scales)
+        count, m = at.sensitivity.shape[:2]
+        c = 0 if self.data.shared is None else self.data.shared.shape[2]
+        nothing, seen = target.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
+        there = Rows(at, target.new_zeros(count, m, c), target.new_zeros(count, m, m), nothing, seen)
+        last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
+        return there, Rows.of(self.around(table, last, candidates).data, self.scales)
+
+
+def with_joints(table: Any, q: Tensor) -> Any:
+    """Rows of one kind at other joint values (N, n)."""
+    return with_attributes(table.parts[0], q=q)
+
+
+def _flags(values: Sequence[bool]) -> Tensor:
+    return torch.tensor(values, dtype=torch.bool, device=HOST)
+
+
+def _freedom(data: TangentData, row: int) -> int:
+    """Degrees of freedom of the bodies that a row shows."""
+    return data.rows(torch.tensor([row], dtype=torch.int64, device=HOST)).measured_freedom
+
+
+def _compared(placed: Placed, target: Rows) -> Tensor:
+    """(T r, T 3 P) what of the errors over the target counts: the markers, or the origins of poses.
+
+    Without a measuring device rigid motions of all of them do not.
+    """
+    count = len(target)
+    whole = torch.block_diag(*origins(placed.lever, target.target).expand(count, -1, -1))
+    if not placed.free:
+        return whole
+    points = target.at.task[0].points.view(count, -1, 3)
+    B = frame_slopes(points, points.mean((0, 1))).flatten(0, 1)
+    return whole - whole @ B @ torch.linalg.pinv(B)

@@ -1,0 +1,198 @@
+"""Is a new row right? By its distance from what the accepted rows predict, and by what explains a larger one.
+
+A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of causes explain errors:
+
+* of one row: its unit, its joints are those of another row, two markers are exchanged, one marker is wrong. A cause is
+  named if the row fits when it is undone.
+* from a row k on: a device has moved, a marker has slipped, a joint has another zero. With w = L^-1 e the whitened
+  errors of the last rows in order and B the effects of a cause, zero before row k, the cause gains |P w|^2, P the
+  projection onto L^-1 B; chance gains chi-squared (diagnostics/moved_devices.py). Rows that were taken in one by one
+  count again here: small changes show in several rows only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import log
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause
+from diffeo_calib.campaign.posterior import Seen, given
+from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+
+
+@dataclass(frozen=True)
+class JudgementLimits:
+    """When a row counts as wrong, and when a cause is named.
+
+    Args:
+        chance: probability that a right row counts as wrong. undone: the same once its mistake is undone.
+        change: probability that chance gains as much as a named change.
+        remaining: probability, by chance, of the errors that a named change leaves.
+        fewest_rows: rows after a change. window: last rows among which changes are sought.
+        spare: numbers beyond the unknowns of a change that must show it.
+        typical_rows: last accepted rows whose squares, at this share of them, say how large right ones are relative
+            to chance; fewest_typical: of them, with fewer it is ``at_first``. A model of few rows is overconfident.
+        told_apart: gain by which a change must exceed that of another cause; else both are named.
+    """
+
+    chance: float = 1e-8
+    undone: float = 1e-3
+    change: float = 1e-9
+    remaining: float = 1e-3
+    fewest_rows: int = 2
+    window: int = 12
+    spare: int = 3
+    typical_rows: int = 30
+    typical_share: float = 0.8
+    fewest_typical: int = 8
+    at_first: float = 2.0
+    told_apart: float = 6.0
+
+
+LIMITS = JudgementLimits()
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that changed between two rows.
+
+    Args:
+        row: number of the first row after it. cause: in words. size: in ``unit``. others: causes that explain as much.
+        fix: what to do.
+    """
+
+    row: int
+    cause: str
+    size: float
+    unit: str
+    others: tuple[str, ...] = ()
+    fix: str = ""
+
+    def __str__(self) -> str:
+        others = "".join(f", or {name}" for name in self.others)
+        by = f"{self.size:.2g} {self.unit} before row {self.row}"
+        return f"{self.cause}{others} has changed by about {by}; {self.fix}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a campaign thinks of a row.
+
+    Args:
+        row: its number. fits: whether it is where the accepted rows before it predict it; None if they could not yet.
+        accepted: whether it was taken in.
+        error: how far it is from its prediction, m: RMS of its numbers. expected: the same as expected.
+        cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
+        expected_error: error of the robot over the target after this row, m; None before the first model.
+        decided: whether the user accepted or rejected it.
+    """
+
+    row: int
+    fits: bool | None
+    accepted: bool
+    error: float = 0.0
+    expected: float = 0.0
+    cause: str = ""
+    change: Change | None = None
+    expected_error: float | None = None
+    decided: bool = False
+
+    def __str__(self) -> str:
+        if self.fits is None:
+            return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}"
+        size = f"{1e3 * self.error:.3g} mm from its prediction, {1e3 * self.expected:.2g} mm are usual"
+        how = "fits" if self.fits and self.change is None else "looks wrong"
+        text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
+        return text if self.change is None else f"{text}; {self.change}"
+
+
+class Measure(NamedTuple):
+    """The distance of a row: d^2, its degrees of freedom, and the RMS of its error and of the expected one, m."""
+
+    square: float
+    freedom: int
+    error: float
+    expected: float
+
+    def fits(self, typical: float, chance: float = LIMITS.chance) -> bool:
+        """Whether chance explains it; ``typical``: size of right squares relative to chi-squared."""
+        return self.square <= typical * chi2_above(chance, self.freedom)
+
+    @property
+    def ratio(self) -> float:
+        """d^2 relative to that which chance exceeds in as many rows as :attr:`JudgementLimits.typical_share` leaves."""
+        return self.square / chi2_above(1.0 - LIMITS.typical_share, self.freedom)
+
+
+def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | None = None) -> Measure:
+    """The distance of a row from what accepted rows and some others say.
+
+    Args:
+        seen: rows in order. row: its place. known: (N,) boolean: the rows that count as right. freedom: of the row.
+        some: (R,) boolean: which of all numbers count; all of the row by default.
+    """
+    owner = seen.rows.owner
+    wanted = (owner == row) if some is None else some & (owner == row)
+    part = given(seen.error, seen.covariance, wanted, known[owner] & (owner != row))
+    square = float(part.error @ torch.linalg.solve(part.covariance, part.error))
+    expected = float(part.covariance.diagonal().mean().clamp(min=0).sqrt())
+    return Measure(square, freedom, float(part.error.square().mean().sqrt()), expected)
+
+
+def exchanged(y: Tensor, bodies: int) -> Iterator[tuple[str, Tensor]]:
+    """Values (1, m) of a row with two bodies exchanged, in words and numbers."""
+    each = y.unflatten(1, (bodies, -1))
+    for a, b in combinations(range(bodies), 2):
+        order = list(range(bodies))
+        order[a], order[b] = b, a
+        yield f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)
+
+
+def find_change(
+    seen: Seen,
+    numbers: list[int],
+    causes: Sequence[Cause],
+    flags: tuple[Tensor, Tensor],
+    *,
+    typical: float,
+    limits: JudgementLimits = LIMITS,
+) -> Change | None:
+    """What changed among rows in order, the last one included; None if chance explains everything.
+
+    Args:
+        seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, m, U) on them, m.
+        flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
+        typical: see :meth:`Measure.fits`.
+    """
+    known, doubted = flags
+    owner, visible, found = seen.rows.owner, seen.rows.visible.flatten(), []
+    for first in range(len(numbers) - limits.fewest_rows + 1):
+        after = (owner >= first) & doubted[owner]
+        part = given(seen.error, seen.covariance, after, (owner < first) & known[owner])
+        low = torch.linalg.cholesky(part.covariance)
+        white = torch.linalg.solve_triangular(low, part.error[:, None], upper=False)[:, 0]
+        for cause in causes:
+            B = cause.effects.flatten(0, 1)[visible][after]
+            spare = len(white) - B.shape[1]
+            if spare < limits.spare:
+                continue
+            columns = torch.linalg.solve_triangular(low, B, upper=False)
+            u = torch.linalg.lstsq(columns, white, driver="gelsd").solution
+            fit = columns @ u
+            gain, left = float(fit.square().sum()) / typical, float((white - fit).square().sum()) / typical
+            if left <= chi2_above(limits.remaining, spare):
+                found.append((gain - B.shape[1] * log(len(white)), gain, first, cause, B @ u, u))
+    best = max(found, key=lambda one: one[0], default=None)
+    if best is None or chi2_probability(best[1], len(best[5])) > limits.change:
+        return None
+    score, _, first, cause, moved, u = best
+    others = {one[3].name for one in found if one[0] > score - limits.told_apart} - {cause.name}
+    unit, size = cause.unit or ("mm", 1e-3)
+    change = float(u.abs().max()) if cause.unit else float((3 * moved.square().mean()).sqrt())
+    return Change(numbers[first], cause.name, change / size, unit, tuple(sorted(others)), cause.fix)

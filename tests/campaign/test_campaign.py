@@ -1,0 +1,204 @@
+"""A campaign judges rows as they come: algebra against a fresh factorisation, named mistakes, the result."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from kind_bank import KINDS, kind_named
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.campaign.posterior import Posterior, Rows
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.fitting.result import silent
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.robots import SimulatedArm
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+ARM = SimulatedArm(3, markers=2)
+ROWS = 34
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def measured() -> tuple[Tensor, Tensor]:
+    return ARM.measure(ROWS + 12, seed=7)
+
+
+@pytest.fixture(scope="module")
+def running(measured: tuple[Tensor, Tensor]) -> dc.Campaign:
+    """A campaign of right rows. Tests copy it."""
+    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(40, seed=8), target=ARM.sample(30, seed=9))
+    campaign.add(*(part[:ROWS] for part in measured))
+    return campaign
+
+
+def after(running: dc.Campaign, q: Tensor, y: Tensor) -> tuple[dc.Campaign, list[Any]]:
+    campaign = copy.deepcopy(running)
+    return campaign, campaign.add(q, y)
+
+
+def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign) -> None:
+    assert running.accepted == list(range(ROWS))
+    assert [one.fits for one in running.verdicts[:12]] == [None] * 12
+    assert all(one.fits for one in running.verdicts[12:])
+    early, late = (running.verdicts[row].expected_error for row in (12, ROWS - 1))
+    assert early is not None
+    assert late is not None
+    assert late < 0.5 * early
+
+
+def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    campaign = copy.deepcopy(running)
+    campaign.reject(5)
+    rows = [row for row in range(ROWS) if row != 5]
+    assert campaign.accepted == rows
+    found = campaign.result()
+    alone = dc.calibrate(ARM.nominal, dc.Measurements(measured[0][rows], measured[1][rows]))
+    q = ARM.sample(20, seed=1)
+    assert torch.equal(found.model(q), alone.model(q))
+    assert torch.equal(found.model.predict(q)[1], alone.model.predict(q)[1])
+
+
+def test_the_expected_error_is_about_the_true_one(running: dc.Campaign) -> None:
+    model, expected = running.result().model, running.expected_error
+    true = float((model(running.target) - ARM.true_points(running.target)).square().sum(-1).mean().sqrt())
+    assert expected is not None
+    assert 0.3 < true / expected < 2
+
+
+def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[ROWS : ROWS + 1] for part in measured)
+    before = measured[0][ROWS - 1]
+    mistakes = {
+        "mm as m": (q, 1e3 * y),
+        "m as mm": (q, 1e-3 * y),
+        "exchanged": (q, y.flip(1)),
+        "row before": (q, ARM.true_points(before[None])),
+        "degrees as radians": (q.rad2deg(), y),
+        "marker 1": (q, y + torch.tensor([[[0.0, 0, 0], [0, 2 * MM, 0]]], dtype=y.dtype)),
+    }
+    for words, rows in mistakes.items():
+        campaign, (verdict,) = after(running, *rows)
+        assert verdict.fits is False, (words, verdict)
+        assert not verdict.accepted, (words, verdict)
+        assert words in verdict.cause, (words, verdict)
+        assert campaign.accepted == list(range(ROWS))
+        campaign.accept(ROWS)
+        assert campaign.accepted == list(range(ROWS + 1))
+
+
+def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
+    running: dc.Campaign, measured: tuple[Tensor, Tensor]
+) -> None:
+    q, y = (part[ROWS:] for part in measured)
+    away = torch.tensor([0.5 * MM, -0.3 * MM, 0.4 * MM], dtype=y.dtype)
+    other = q + torch.tensor([0, 2e-3, 0, 0, 0, 0], dtype=q.dtype)
+    cases = {"device": (q, y + away), ARM.nominal.joint_names[1]: (q, ARM.true_points(other))}
+    for words, rows in cases.items():
+        campaign, verdicts = after(running, *(part[:8] for part in rows))
+        change = next(one.change for one in verdicts[::-1] if one.change is not None)
+        assert change is not None, (words, str(verdicts[-1]))
+        assert words in (change.cause, *change.others)[0], (words, str(verdicts[-1]))
+        assert change.row == ROWS
+        assert campaign.accepted == list(range(ROWS))
+    assert 1 < change.size < 4
+    assert change.unit == "mrad"
+
+
+def test_rows_taken_one_by_one_are_those_of_a_fresh_factor(running: dc.Campaign) -> None:
+    model: Any = copy.deepcopy(running)._model
+    rows = Rows.of(model.data, model.scales)
+    index = torch.arange(len(rows))
+    whole = Posterior(rows.rows(index[:9]), model.posterior.asked)
+    grown = Posterior(rows.rows(index[:3]), model.posterior.asked)
+    later = grown.see(rows.rows(index[3:]))
+    for row in range(3, 9):
+        alone = grown.see(rows.rows(index[row : row + 1]))
+        later = grown.see(rows.rows(index[3:]), grown.take(alone, later))
+    expected = whole.see(rows.rows(index[3:]))
+    assert_close(later.error, expected.error)
+    assert_close(later.covariance, expected.covariance)
+    assert_close(grown.known, whole.known)
+
+
+def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:
+    found = running.next(3, goal=1e-9)
+    assert found is not None
+    assert len(found.q) == 3
+    assert found.needed is None
+    near = running.next(3, goal=0.9 * found.expected[0])
+    assert near is not None
+    assert near.needed is not None
+    assert near.needed > 0
+    assert torch.equal(running.candidates[found.rows], found.q)
+    gained = {}
+    for row in (found.rows[0], *(k for k in range(0, 40, 7) if k != found.rows[0])):
+        q = running.candidates[row : row + 1]
+        campaign, _ = after(running, q, ARM.true_points(q))
+        gained[row] = campaign.expected_error
+    assert min(gained, key=lambda row: gained[row] or 1.0) == found.rows[0]
+    assert_close(gained[found.rows[0]], found.expected[1], rtol=0.02, atol=0.0)
+
+
+def test_a_thread_makes_the_same_models(measured: tuple[Tensor, Tensor]) -> None:
+    campaign = dc.Campaign(ARM.nominal, background=True)
+    for q, y in zip(*(part[:20] for part in measured), strict=True):
+        campaign.add(q, y)
+    campaign.wait()
+    assert campaign.models > 0
+    assert campaign.expected_error is not None
+    assert campaign.accepted == list(range(20))
+
+
+def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
+    campaign = copy.deepcopy(running)
+    for mistake in (lambda: campaign.add(5), lambda: campaign.reject(ROWS), lambda: dc.Campaign(3)):  # pyright: ignore
+        with pytest.raises(InputError):
+            mistake()
+    with pytest.raises(MeasurementError):
+        campaign.add(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, 3, dtype=torch.float64))
+    assert len(campaign) == ROWS
+    assert campaign.accepted == list(range(ROWS))
+    with pytest.raises(InputError):
+        dc.Campaign(ARM.nominal).result()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> None:
+    """Taken for other rows, the rows of a calibration are what they were in it."""
+    kind = kind_named(name)
+    placed = place(kind.robot, kind.data, silent)
+    like = placed.tangent_data()
+    _, found = placed.beside(kind.data, like)
+    for part in ("y", "points", "sensitivities", "shared"):
+        own, other = getattr(like, part), getattr(found, part)
+        assert (own is None) == (other is None)
+        if own is not None:
+            assert_close(other, own, msg=lambda text, part=part: f"{part}: {text}")
+    assert_close(found.noise(kind.scales), like.noise(kind.scales))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sessions", "mixture", "several kinds", "payloads"])
+def test_other_kinds_of_rows(name: str) -> None:
+    """The rows of the bank in random order, as many as for two models."""
+    kind = kind_named(name)
+    rows = joined_tables([kind.data, kind.new])
+    order = torch.randperm(len(rows), generator=torch.Generator("cpu").manual_seed(0))[:30]
+    campaign = dc.Campaign(kind.robot, candidates=kind.q(20), target=kind.q(10))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        verdicts = campaign.add(rows.rows(order))
+    judged = [one for one in verdicts if one.fits is not None]
+    assert len(judged) > 10, [str(one) for one in verdicts]
+    assert sum(one.fits is False for one in judged) <= 0.05 * len(judged), [str(o) for o in judged if not o.fits]
+    found = campaign.next(2)
+    assert found is not None
+    assert found.expected[2] < found.expected[0]

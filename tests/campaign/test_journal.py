@@ -1,0 +1,143 @@
+"""What a campaign keeps: nothing is lost and nothing half is taken, whenever it is killed."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from command_bank import PROGRAM, Command
+
+import diffeo_calib as dc
+from diffeo_calib.campaign.journal import GrowingTable, Journal
+from diffeo_calib.cli.commands.campaign import append_row
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+
+ROWS = 24
+WRONG = 20
+"""A row whose positions are 1000 times too large."""
+CAMPAIGN = """csv = "run.csv"
+robot = "robot.urdf"
+base = "base_link"
+tip = "flange"
+position = ["x,y,z"]
+length = "mm"
+angle = "deg"
+output = "robot.safetensors"
+holdout = 0.2
+"""
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> list[str]:
+    """The lines of a table; its campaign file and robot are beside it."""
+    arm = SimulatedArm(2)
+    q, points = arm.measure(ROWS, seed=1)
+    points[WRONG] *= 1e3
+    arm.write_urdf(tmp_path / "robot.urdf")
+    data = dc.Measurements(q, points, arm.nominal.joint_names, doubt=False)
+    write_measurements(tmp_path / "all.csv", data, TableFormat("mm", "deg"))
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+    return (tmp_path / "all.csv").read_text().splitlines(keepends=True)
+
+
+def test_a_torn_line_is_removed_and_the_others_stay(tmp_path: Path) -> None:
+    path = tmp_path / "run.journal"
+    with Journal(path) as journal:
+        journal.add([{"line": 2}, {"line": 3}])
+    for cut in range(1, 12):
+        with path.open("ab") as file:
+            file.write(b'{"line": 4}\n'[:cut])
+        with Journal(path) as journal:
+            assert journal.entries == [{"line": 2}, {"line": 3}]
+        assert path.read_bytes() == b'{"line": 2}\n{"line": 3}\n'
+
+
+def test_a_second_writer_and_another_file_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.journal"
+    with Journal(path), pytest.raises(InputError, match="another process"):
+        Journal(path)
+    path.write_text("x,y\n1,2\n")
+    with pytest.raises(InputError, match="not the journal"):
+        Journal(path)
+
+
+def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    table = GrowingTable(path)
+    assert table.new_lines() == []
+    seen = []
+    for text in ("a", ",b\n1", ",2\n3,", "4\n", "\n5,6\n7"):
+        with path.open("a") as file:
+            file.write(text)
+        seen += table.new_lines()
+    assert table.header == b"a,b\n"
+    assert seen == [b"1,2\n", b"3,4\n", b"5,6\n"]
+    path.write_text("a,b\n")
+    with pytest.raises(InputError, match="shorter"):
+        table.new_lines()
+
+
+def test_rows_as_json_are_appended_whole(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    append_row(path, '{"a": 1.5, "b": "s"}\n', ";", ",")
+    path.write_bytes(path.read_bytes() + b"7;")  # torn by a crash
+    append_row(path, '{"b": "t", "a": -2e-05}\n', ";", ",")
+    assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n"
+    for bad in ('{"a": 1', '{"a": 1}', "[1]\n", "{}\n", '{"c": 1}\n'):
+        with pytest.raises(InputError):
+            append_row(path, bad, ";", ",")
+    assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n"
+
+
+def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[str], command: Command) -> None:
+    (tmp_path / "run.csv").write_text("".join(lines[:15]) + lines[15][:20])
+    words = ["campaign", tmp_path / "campaign.toml", "--once"]
+    first = command(*words, "--target", "1um")
+    assert first.code == 4
+    (tmp_path / "run.csv").write_text("".join([*lines[:3], "1,2,three\n", *lines[3:]]))
+    assert "changed after" in command(*words).error
+    (tmp_path / "run.csv").write_text("".join([*lines[:22], "1,2,three\n", *lines[22:]]))
+    done = command(*words, "--accepted", tmp_path / "accepted.csv")
+    assert done.code == 0
+    assert "going on after 14 lines" in done.out
+    assert "row 13 " not in done.out
+    assert "mm as m" in done.out
+    assert "line 23 left out" in done.out
+    kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
+    assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
+    assert command(*words, "--target", "50mm").code == 0
+
+
+@pytest.mark.slow
+def test_a_killed_campaign_loses_no_row(tmp_path: Path, lines: list[str]) -> None:
+    """kill -9 at random moments while rows come by JSON lines; every row that the table has is judged once."""
+    names = lines[0].strip().split(",")
+    rows = [dict(zip(names, map(float, line.split(",")), strict=True)) for line in lines[1:]]
+    generator, sent = random.Random(0), 0
+    command = [sys.executable, "-c", PROGRAM, "campaign", "campaign.toml", "--stdin"]
+    for attempt in range(6):
+        process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert process.stdin is not None
+        for row in rows[sent:] if attempt == 5 else rows[sent : sent + 5]:
+            process.stdin.write(json.dumps(row) + "\n")
+        process.stdin.flush()
+        if attempt == 5:
+            assert process.communicate(timeout=300)[0]
+            break
+        time.sleep(generator.uniform(1, 6))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        table = tmp_path / "run.csv"
+        sent = max(table.read_bytes().count(b"\n") - 1, 0) if table.exists() else 0
+    journal = [json.loads(line) for line in (tmp_path / "run.csv.journal").read_text().splitlines()]
+    assert [one["line"] for one in journal if "line" in one] == list(range(2, ROWS + 2))
+    assert (tmp_path / "run.csv").read_text().count("\n") == ROWS + 1
