@@ -284,7 +284,9 @@ def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command
 def test_measured_positions_decide_about_a_tolerance() -> None:
     """The error that a model of several kinds expects of itself is below it; new rows are not."""
     kind = kind_named("mixture")
-    tracked, _ = divided(kind.new)[0]
+    own = divided(kind.new)[0]
+    assert own is not None
+    tracked = own.table
     wrong = with_attributes(tracked, points=tracked.points + 0.003 * torch.sin(97.0 * tracked.points))
     found = find_kinds(kind.model, wrong)
     assert found.deviations.error.whole < 1e-3 < found.rms

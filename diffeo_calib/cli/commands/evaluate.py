@@ -169,8 +169,8 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     for kind, after in kinds.items():
         table = ErrorTable(after, f"of {plain(name)}", "rows")
         if known:
-            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
-        table.add(after, f"{after.count} after registration")
+            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} with the places of the fit")
+        table.add(after, f"{after.count} with places found anew")
         out.print(table)
     for line in (*registration_lines(found), *placement_sentences(found)):
         say(plain(line))

@@ -226,6 +226,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             if other is not None:
                 table.add(other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
+        if held_out is not None and other is None:
+            say("no row of this kind was held out: these are errors on rows that were fitted")
         if held_out is None and place == 0:
             measured = one.one.what == ERRORS
             left_out = f" (leave-one-out RMS {1e3 * result.left_out_rms:.4f} mm)" * measured

@@ -73,7 +73,7 @@ def _found(result: Recalibration) -> list[str]:
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
     lines = [
         f"the markers {markers[result.marker]}",
-        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model after registration, "
+        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model, device and markers found anew, "
         f"{1e3 * result.left_out_rms:.4f} mm if each is predicted by the old rows and the other new ones",
     ]
     if result.outliers:
