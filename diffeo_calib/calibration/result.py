@@ -27,11 +27,11 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
-from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.places import Places, sensor_key
+from diffeo_calib.sensors.tables import with_positions
 
 STAGES = "nominal + registration", "geometry", "diffeomorphic"
 """Names of the stages of a calibration."""
@@ -118,8 +118,7 @@ class CalibrationResult:
 
     def aligned(self, data: Any) -> Any:
         """Rows of the same sessions in the frame of the model; those without positions, and of one session, stay."""
-        parts = [own if own.without_device else self.placement.aligned(own) for own in data.parts]
-        return Observations(parts, data.index) if len(parts) > 1 else parts[0]
+        return with_positions(data, self.placement.aligned)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

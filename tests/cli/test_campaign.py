@@ -16,7 +16,7 @@ from typer.main import get_command
 import diffeo_calib as dc
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
-from diffeo_calib.cli.proposals import (
+from diffeo_calib.cli.guesses import (
     guess_deviations,
     guess_joints,
     guess_positions,

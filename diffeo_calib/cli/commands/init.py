@@ -10,8 +10,8 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
 from diffeo_calib.cli.options import CORNERS
-from diffeo_calib.cli.proposals import Sheet, guess_joints, guess_sheet
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
