@@ -123,9 +123,11 @@ def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, sc
         assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
         assert seen.evaluate("document.documentElement.scrollWidth <= innerWidth")
         with seen.expect_response("**/reject?**"):
-            seen.click("button[data-row='15']")
+            seen.focus("button[data-row='15']")
+            seen.keyboard.press("Enter")
         with seen.expect_response("**/accept?**"):
-            seen.click("button[data-row='14']")
+            seen.focus("button[data-row='14']")
+            seen.keyboard.press("Enter")
         assert [page.decisions.get(timeout=5), page.decisions.get(timeout=5)] == [(15, False), (14, True)]
         seen.reload()
         seen.wait_for_selector("li")
