@@ -435,7 +435,7 @@ BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
 NOT_YET: dict[tuple[str, str], str] = {
-    **{(verb, kind): "refused" for verb in ("registered", "evaluate --register", "init") for kind in OWN},
+    **{(verb, kind): "refused" for verb in ("init",) for kind in OWN},
 }
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")

@@ -23,7 +23,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
-from diffeo_calib.interop.files import FORMAT, Header
+from diffeo_calib.interop.container import FORMAT, Header
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

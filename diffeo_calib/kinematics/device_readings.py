@@ -31,7 +31,7 @@ class PredictedReadings:
 
     Args:
         kind: of its readings. device: its name. unit: of the readings.
-        mean: (N, r) readings; NaN where the device cannot see the ball. covariance: (N, r, r) of these, in its square.
+        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these, in its square.
     """
 
     kind: str
@@ -79,7 +79,7 @@ class _Device(NamedTuple):
         numbers = fitted.noise.visible[rows][0]
         effects = fitted.noise.shared[rows][:, numbers]  # (M, r, c)
         columns = (effects != 0).any(1).any(0)
-        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3:])
+        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3 * devices.seen_points :])
         if int(columns.sum()) != slopes.shape[2]:
             return placed
         deviations = (effects[..., columns].square().sum((0, 1)) / slopes.square().sum((0, 1))).sqrt()
@@ -92,9 +92,10 @@ class _Device(NamedTuple):
 
     def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
         """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        ball, observation = seen.points[:, -3:], self.observation(len(seen.points))
-        A = torch.nn.functional.pad(observation.slope(ball), (seen.points.shape[1] - 3, 0))
-        B = observation.by_constants(ball) * self.deviations
+        width, observation = 3 * self.devices.seen_points, self.observation(len(seen.points))
+        points = seen.points[:, -width:]
+        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - width, 0))
+        B = observation.by_constants(points) * self.deviations
         if self.columns is None:
             covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
         else:
@@ -104,7 +105,7 @@ class _Device(NamedTuple):
             covariance = covariance + moved @ moved.mT
         if noise:
             covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
-        return observation.value(ball), covariance
+        return observation.value(points), covariance
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:

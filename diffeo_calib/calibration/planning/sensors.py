@@ -21,6 +21,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.places import PlacedDevices
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
@@ -366,7 +367,7 @@ def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
             rows, kind = one.rows[one.device == number].to(noise.shared.device), known_kinds()[one.kind]
             effects = noise.shared[rows[0], noise.visible[rows[0]]]
             offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
-            prior, name = one.constants.new_tensor(kind.prior(offset)), f"{one.kind} {one.names[number]}"
+            prior, name = one.constants.new_tensor(kind.prior(offset)), _called(model, one, number)
             found.append((rows, kind((name,), one.constants[number, None], prior)))
     return found
 
@@ -388,9 +389,14 @@ def _name(model: CalibratedKinematics, rows: Tensor) -> str:
     for own in model.placement:
         for name, row in zip([own.names[number] for number in own.device.tolist()], own.rows.tolist(), strict=True):
             if row == first:
-                alone = sum(name in other.names for other in model.placement) == 1
-                return name if alone else f"{own.kind} {name}"
+                return _called(model, own, own.names.index(name))
     return f"device of row {first}"
+
+
+def _called(model: CalibratedKinematics, own: PlacedDevices, number: int) -> str:
+    """Name of a device, after its kind where another kind has the same name."""
+    name = own.names[number]
+    return name if sum(name in other.names for other in model.placement) == 1 else f"{own.kind} {name}"
 
 
 def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) -> DeviceReadings:

@@ -1,0 +1,88 @@
+"""The container of model files: arrays by name in safetensors, a JSON header, a checksum. Needs NumPy alone.
+
+A SHA-256 checksum over header and arrays detects damaged and edited files. Reading executes nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from diffeo_calib.common.errors import ModelFileError
+
+FORMAT = 3
+"""Version of the file layout; files of other versions are refused."""
+ENTRY = "diffeo_calib"
+"""Key of the header in the file's metadata."""
+
+UNSOUND = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What contents raise that do not fit together: forged headers hold any value in any place."""
+
+Header = dict[str, Any]
+
+
+def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
+    """Header and arrays of a file, after checking its format and checksum.
+
+    Raises:
+        ModelFileError: the file cannot be read, or has another format or a wrong checksum.
+    """
+    if not path.is_file():
+        raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
+    _check_beginning(path)
+    try:
+        with safe_open(path, framework="np") as file:
+            text = (file.metadata() or {}).get(ENTRY)
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
+        header = json.loads(text) if text is not None else None
+        sealed = isinstance(header, dict) and header.pop("digest", None) == digest(header, arrays)
+    except (SafetensorError, OSError, *UNSOUND) as error:
+        raise ModelFileError.of(
+            f"{path} cannot be read as a model file ({error})",
+            fix="it is damaged or cut short: copy or save it again",
+        ) from error
+    if not isinstance(header, dict):
+        raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
+    if header.get("format") != FORMAT:
+        raise ModelFileError.of(
+            f"{path} has format version {header.get('format')!r}",
+            expected=FORMAT,
+            fix="read it with the version that wrote it",
+        )
+    if not sealed:
+        raise ModelFileError.of(
+            f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
+        )
+    return header, arrays
+
+
+def _check_beginning(path: Path) -> None:
+    """Refuse a file that never was a model: eight bytes of length, then a JSON header."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(9)
+    except OSError as error:
+        what = f"{path} cannot be read as a model file ({error.strerror})"
+        raise ModelFileError.of(what, fix="pass the name of a readable file") from error
+    if len(beginning) < 9 or beginning[8:] == b"{":
+        return  # what is cut short has its own sentence
+    kind = "a URDF" if path.suffix.lower() in (".urdf", ".xml", ".xacro") else "another kind of file"
+    what, fix = f"{path} cannot be read as a model file: it is {kind}", "pass a file written by `save` or `fit -o`"
+    raise ModelFileError.of(what, fix=fix)
+
+
+def digest(header: Header, arrays: Mapping[str, Any]) -> str:
+    """SHA-256 over a header (without its checksum) and the arrays, or tensors on the CPU."""
+    sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        shape = tuple(int(size) for size in arrays[name].shape)
+        sha.update(f"{name} torch.{array.dtype} {shape}".encode())
+        sha.update(array.tobytes())
+    return sha.hexdigest()
