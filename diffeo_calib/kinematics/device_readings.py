@@ -31,7 +31,7 @@ class PredictedReadings:
 
     Args:
         kind: of its readings. device: its name. unit: of the readings.
-        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these, in its square.
+        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these.
     """
 
     kind: str
