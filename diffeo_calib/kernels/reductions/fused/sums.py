@@ -63,7 +63,9 @@ class Machine:
         self.llvm, self.lock, self.loaded = llvm, Lock(), set[str]()
         options = {"cpu": name, "features": features, "opt": 3, "reloc": "pic", "codemodel": "small"}
         self.target = llvm.Target.from_triple(triple).create_target_machine(**options)
-        self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), self.target)
+        # one block of memory for each module: in a process with much memory its sections may else lie too far apart for
+        # the addresses of the small code model, and LLVM ends the process
+        self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), self.target, use_lmm=True)
 
     def functions(self, text: str, names: Mapping[str, int]) -> list[Any]:
         """Compile a module, or load what an earlier process compiled, and return some of its functions.
