@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 
-from diffeo_calib.cli.interrupts import interrupts
+from diffeo_calib.cli.console import interrupts
 
 
 def main() -> None:

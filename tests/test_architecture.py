@@ -340,7 +340,7 @@ w = f(data.sockets)
 
 
 def test_one_table_of_the_priors_of_places() -> None:
-    """Numbers are in robots/place_priors.py alone."""
+    """Numbers are in robots/placement.py alone."""
     pattern = re.compile(r"^[A-Z_]*(PLACE|BASE|TOOL|FRAME|MARKER|TURN|BALL)_DEVIATION[A-Z_]* = .*[0-9]", re.MULTILINE)
     assert pattern.search("PLACE_DEVIATION_M = 0.1")
     found = [path.name for path in SOURCES.values() if pattern.search(path.read_text(encoding="utf-8"))]

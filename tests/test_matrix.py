@@ -42,6 +42,8 @@ WHAT = {
     "heights": {("readings", "m")},
     "images": {("readings", "px")},
     "several kinds": {("errors", "m"), ("readings", "m"), ("readings", "px")},
+    "laser beams": {("errors", "m"), ("readings", "m")},
+    "inclinations": {("errors", "m"), ("readings", "mrad")},
 }
 """What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
 
@@ -427,17 +429,13 @@ def _(bench: Bench) -> None:
 # --- the table ------------------------------------------------------------------------------------------------------
 
 WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
-READ = ("distances", "heights", "images", "several kinds")
+OWN = ("laser beams", "inclinations")
+"""Kinds of devices from outside the package, beside positions and beside poses."""
 BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
 EXCEPT: dict[tuple[str, str], str] = {}
 """Why a pair cannot work: words of the message that says so."""
 NOT_YET: dict[tuple[str, str], str] = {
-    **{("registered", kind): "refused" for kind in ("mixture", "several kinds")},
-    **{("evaluate --register", kind): "refused" for kind in ("mixture", "several kinds")},
-    **{("predict", kind): "different" for kind in READ},  # not what their devices will read
-    **{("compare with a table", kind): "refused" for kind in ("images",)},
-    **{("recalibrate", kind): "refused" for kind in ("images",)},
-    **{("init", kind): "refused" for kind in ("images", "images of a board", "several kinds")},
+    **{(verb, kind): "refused" for verb in ("init",) for kind in OWN},
 }
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")

@@ -7,7 +7,7 @@ from lxml import html
 from product_bank import Case
 
 import diffeo_calib as dc
-from diffeo_calib.common.notebook import table_html
+from diffeo_calib.common.data_frames import table_html
 
 
 @pytest.mark.parametrize("name", ["arm", "posed"])

@@ -38,7 +38,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.kernels.reductions import distributed
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 SIZES = {"sum": (4096, 16384, 65536), "loss_and_gradient": (1024, 4096), "fit": (12_000,)}

@@ -39,7 +39,7 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 
 PROFILES = {
     "Gaussian": GaussianProfile(),

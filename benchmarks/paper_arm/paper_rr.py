@@ -60,7 +60,7 @@ from diffeo_calib.fitting.fit import Formulation, Solver, formulate
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.flows.integrators import Integrator, RungeKutta
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 
 GRID = 16
 SIGMAS = (0.01, 0.001)

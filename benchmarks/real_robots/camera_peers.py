@@ -11,8 +11,7 @@ from simulated_camera import HEIGHT, WIDTH
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.identification.robust_registration import find_joint_offsets, with_joint_offsets
+from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.robots.geometry import Geometry

@@ -30,7 +30,7 @@ NEAR, FAR, VIEW = 0.25, 0.6, 0.85
 WIDTH, HEIGHT, SQUARE, CORNERS = 1280, 960, 0.03, (7, 5)
 """Of the images, pixels; side of a square of the board, m, and its inner corners along x and y."""
 LENS = 1200.0, 1195.0, 650.0, 470.0, -0.15, 0.08, 1e-3, -5e-4, 0.0
-"""True lens of the camera, see diffeo_calib.cameras.lens."""
+"""True lens of the camera, see diffeo_calib.cameras.board."""
 PRINT = 1e-4, 1e-4, 1e-3, 0.0, -5e-4
 """True errors of the printed board, see diffeo_calib.cameras.board."""
 BOARD_PRIOR = BoardPrior(scale=2e-4)

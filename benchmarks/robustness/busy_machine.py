@@ -33,7 +33,7 @@ from landmarks import landmarks
 from ours import Ours
 
 import diffeo_calib as dc
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 REPEATS, QUICK_REPEATS = 7, 2

@@ -405,7 +405,7 @@ def judged(arm: SimulatedArm, campaign: Campaign) -> Record:
     if result is None:
         return {"silent": False, "said": words}
     q = arm.sample(TRUTH_ROWS, 999)
-    truth, points = arm.true_points(q)[:, 0], result.model(q).detach()[:, -1]  # the last marker is the ball
+    truth, points = arm.true_points(q)[:, -1], result.model(q).detach()[:, -1]  # the last marker is the ball
     if getattr(campaign.data, "lever", None) is not None:
         points = result.model.poses(q).detach()[:, :3, 3]
     T = rigid_fit(points, truth)

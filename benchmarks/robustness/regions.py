@@ -12,6 +12,9 @@ registered     a model of 150 rows of a simulated arm, or of a whole series of t
                anew from `rows` rows of another date, drawn at random
 recalibrated   `dc.recalibrate` of that model with the same rows
 
+scales_of      a calibration of `rows` rows with the scales of a model of 150 rows: of another arm of the same kind and
+               chain, or of the other series of the UR10
+
 On the other date, device and marker of a simulated arm are elsewhere and its errors differ by `drift` (0, 5 or 20 %).
 
 Fields of a record: `new` is the share of held-out measurements in the regions of `predict`, `robot` that of the true
@@ -33,6 +36,7 @@ from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 
 import harness
 import numpy as np
@@ -47,7 +51,8 @@ from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.robots.simulated_arm import URDF_FILE
 
 SIZES, DATED_SIZES, SEEDS = (15, 20, 30, 40, 60, 150, 300), (10, 20, 60), 2
-METHODS = ("fresh", "registered", "recalibrated")
+METHODS = ("fresh", "scales_of", "registered", "recalibrated")
+FRESH = METHODS[:2]
 TEST_ROWS, OLD_ROWS = 400, 150
 OLD_SERIES_ROWS = {"ipa_ur10_a": 700, "ipa_ur10": 442}
 OTHER_SERIES = {"ipa_ur10_a": "ipa_ur10", "ipa_ur10": "ipa_ur10_a"}
@@ -118,6 +123,14 @@ def case(name: str, rows: int, seed: int, folder: Path | None) -> Case:
 
 
 @cache
+def other_robot(name: str, seed: int, folder: Path | None) -> dc.CalibratedKinematics:
+    """The model of another robot of the same type."""
+    other = seed if name in OTHER_SERIES else seed + len(chains(folder))
+    found = case(OTHER_SERIES.get(name, name), OLD_ROWS, other, folder)
+    return dc.calibrate(found.robot, found.train).model
+
+
+@cache
 def old_model(name: str, seed: int, folder: Path | None) -> dc.CalibratedKinematics:
     """The model of an earlier date, or of another robot of the same type."""
     rows = OLD_SERIES_ROWS.get(name, OLD_ROWS)
@@ -153,21 +166,21 @@ def _share(error: Tensor, covariance: Tensor) -> float:
 def measured(keys: Record, name: str, rows: int, seed: int, plan: Namespace) -> Record:
     """One model, judged; a failure becomes a record with the reason."""
     try:
-        if keys["method"] == "fresh":
-            found, old = case(name, rows, seed, plan.data), None
+        method, old = keys["method"], None
+        if method in FRESH:
+            found = case(name, rows, seed, plan.data)
+            others = [other_robot(name, seed, plan.data)] if method == "scales_of" else []
         else:
-            drift = float(keys["drift"] or 0.0)
+            others, drift = [], float(keys["drift"] or 0.0)
             earlier, found = another_date(name, rows, seed, drift, plan.data)
             old = old_model(earlier, seed, plan.data)
         begin = time.perf_counter()
         if old is None:
-            model = dc.calibrate(found.robot, found.train).model
+            model = dc.calibrate(found.robot, found.train, scales_of=others).model
+        elif method == "registered":
+            model = old.registered(found.train)
         else:
-            model = (
-                old.registered(found.train)
-                if keys["method"] == "registered"
-                else dc.recalibrate(old, found.train).model
-            )
+            model = dc.recalibrate(old, found.train).model
         return {**keys, **judged(model, found), "seconds": time.perf_counter() - begin}
     except Exception as error:  # the others are still measured
         return {**keys, "note": f"{type(error).__name__}: {error}"}
@@ -176,14 +189,13 @@ def measured(keys: Record, name: str, rows: int, seed: int, plan: Namespace) -> 
 def measure(plan: Namespace) -> Iterator[Record]:
     """Yield a record for every method, set and number of rows."""
     for method in plan.methods:
-        fresh = method == "fresh"
-        sizes = plan.sizes or (SIZES if fresh else DATED_SIZES)
-        for rows, seed, name in ((r, s, n) for r in sizes for s in range(plan.seeds) for n in plan.cases):
-            if not fresh and name not in (*DATED_KINDS, *OTHER_SERIES):
-                continue
-            for drift in (None,) if fresh or name in OTHER_SERIES else DRIFTS:
-                keys: Record = {"method": method, "case": name, "rows": rows, "seed": seed, "drift": drift}
-                yield measured(keys, name, rows, seed, plan)
+        fresh = method in FRESH
+        known = plan.cases if method == "fresh" else [*KINDS, *OTHER_SERIES] if fresh else [*DATED_KINDS, *OTHER_SERIES]
+        for rows in plan.sizes or (SIZES if fresh else DATED_SIZES):
+            for seed, name in product(range(plan.seeds), [name for name in plan.cases if name in known]):
+                for drift in (None,) if fresh or name in OTHER_SERIES else DRIFTS:
+                    keys: Record = {"method": method, "case": name, "rows": rows, "seed": seed, "drift": drift}
+                    yield measured(keys, name, rows, seed, plan)
 
 
 def summary(records: list[Record]) -> list[Record]:
@@ -194,7 +206,7 @@ def summary(records: list[Record]) -> list[Record]:
         if not some:
             continue
         new, robot, sharp, rms = (_numbers(some, name) for name in ("new", "robot", "sharpness", "rms_mm"))
-        low, high = DATED_RANGE if method != "fresh" else MANY_RANGE if count >= MANY_ROWS else FEW_RANGE
+        low, high = DATED_RANGE if method not in FRESH else MANY_RANGE if count >= MANY_ROWS else FEW_RANGE
         row: Record = {"method": method, "rows": count, "sets": len(some), "new": _range(new)}
         row |= {"within": float(((new >= low) & (new <= high)).mean()), "robot": _range(robot)}
         row |= {"sharpness": _range(sharp), "sharp": float(((sharp >= SHARP[0]) & (sharp <= SHARP[1])).mean())}

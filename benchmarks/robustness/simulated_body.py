@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import rotation, transforms

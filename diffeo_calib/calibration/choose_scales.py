@@ -9,16 +9,19 @@
 5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
+
+The fitting problem of the exact model of a robot.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
-from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -28,11 +31,15 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     leave_one_out,
     tails_of_many,
 )
-from diffeo_calib.calibration.scales.selection import Selection, select
+from diffeo_calib.calibration.scales.of_models import scales_of_models
+from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
+from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.maps.noise import Noise
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,7 @@ def choose_scales(
     identification: Identification,
     *,
     given: Hyperparameters | None = None,
+    models: Sequence[CalibratedKinematics] = (),
     seed: int = 0,
     progress: Progress = silent,
 ) -> ChosenScales:
@@ -96,7 +104,8 @@ def choose_scales(
     Args:
         data: the measurements around the geometric calibration. measurements: the same as they were measured.
         registration: base and markers. identification: the geometric calibration.
-        given: scales that are used as they are.
+        given: scales that are used as they are. models: of robots of the same type, whose scales are used, inflated
+            where leave-one-out errors contradict them.
         seed: draws the poses on which scales are selected.
         progress: called as ``progress(task, done, total)``.
 
@@ -105,13 +114,16 @@ def choose_scales(
     """
     rows, some = data.sample(len(data.x), LIMITS.coordinates, seed)
     if len(rows) < len(data.x):
-        stages = registration, identification
-        chosen = choose_scales(some, measurements[rows], *stages, given=given, seed=seed, progress=progress)
+        stages, how = (registration, identification), {"given": given, "models": models}
+        chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
         return _of_all_rows(chosen, data, seed)
     if given is not None:
         return _given(given, data, seed)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
+    if models:
+        found, data = _of_models(models, centre, data, seed)
+        return _inflated(found, None, data, measurements, seed=seed, progress=progress)
     if poses < LIMITS.fewest_poses:
         found = _defaults_of_few(centre, poses, len(measurements))
     else:
@@ -124,9 +136,20 @@ def choose_scales(
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
+def _of_models(
+    models: Sequence[CalibratedKinematics], centre: Hyperparameters, data: TangentData, seed: int
+) -> tuple[Selection, TangentData]:
+    """The scales of models of the same type of robot, and the measurements with the weights that follow."""
+    scales = scales_of_models(models, centre)
+    data = data.with_gear_lines(scales.lines)
+    scales = with_payload_factor(data, scales, seed)
+    status = f"those of {len(models)} other model{'s' * (len(models) > 1)}"
+    return Selection(scales, status), data.with_tails(estimate_tails(data, scales, seed))
+
+
 def _inflated(
     found: Selection,
-    centre: Hyperparameters,
+    centre: Hyperparameters | None,
     data: TangentData,
     measurements: Any,
     *,
@@ -167,7 +190,7 @@ def _of_all_rows(chosen: ChosenScales, data: TangentData, seed: int) -> ChosenSc
 
 
 def _inflation(
-    centre: Hyperparameters,
+    centre: Hyperparameters | None,
     found: Selection,
     data: TangentData,
     measurements: Any,
@@ -176,11 +199,11 @@ def _inflation(
     seed: int,
     progress: Progress,
 ) -> tuple[float, Selection]:
-    """Factor on all variances, and the selection, interrupted if Ctrl-C came."""
+    """Factor on all variances, and the selection, interrupted if Ctrl-C came; no ``centre``: scales of other robots."""
     groups = measurements.groups().to(data.x.device)
     poses = int(groups.max()) + 1
     factor = left_out.inflation(poses)
-    if poses < LIMITS.fewest_poses or found.interrupted:
+    if centre is not None and (poses < LIMITS.fewest_poses or found.interrupted):
         return factor, found
     inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
     return inflation or factor, replace(found, interrupted=inflation is None)
@@ -267,3 +290,27 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     _, some = data.sample(POSES, COORDINATES, seed)
     tried = [replace(scales, payload=factor) for factor in FACTORS]
     return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))
+
+
+RESIDUAL_TOLERANCE = 1e-5
+"""Of coupling and end residual: the remaining error is far below the noise."""
+
+
+def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
+    """Measurements of a robot, with the kernels, priors and noise that the scales determine.
+
+    Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
+    """
+    problem = Problem(
+        data.nominal.typical,
+        data.x,
+        data.y,
+        joint_kernel=scales.joint_kernel(data.space),
+        task_kernel=scales.task_kernel(),
+        noise=Noise(data.weighted_noise(scales), data.shared),
+        markers=data.nominal.geometry.markers,
+        prior_variance=data.prior_variance(scales),
+        new_noise=new_noise(data, scales),
+        observe=data.observe,
+    )
+    return problem.with_nominal_of_rows(data.nominal)

@@ -17,28 +17,33 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import hypot
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import sampled_configurations, undetermined_places
 from diffeo_calib.calibration.identification.identification import Identification, Prior
+from diffeo_calib.common.errors import printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
+from diffeo_calib.robots.placement import PLACES, rigid_fit
+from diffeo_calib.sensors.tables import device_coordinates
 
 
 def workspace_deviation(fitted: FittedMap) -> float:
     """Root mean square distance, m, between modelled and true positions that the model expects over its workspace.
 
-    Of the last marker, the ball.
+    Of the last marker, the ball, and with everything that the rows leave open.
     """
     covariance = fitted.posterior(fitted.everywhere, noise=False)[1]
-    return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
+    return _distance(covariance[:, -3:, -3:])
 
 
 def stands_free(model: CalibratedKinematics) -> bool:
@@ -46,61 +51,246 @@ def stands_free(model: CalibratedKinematics) -> bool:
     return model.map.unregistered.workspace is not None
 
 
-def expected_of(model: CalibratedKinematics) -> float:
-    """See :func:`workspace_deviation`."""
-    return workspace_deviation(model.map.unregistered)
+OPEN_RATIO = 10.0
+"""A direction of base and markers is open if it moves points anywhere by this factor more than in the rows, or than
+their noise."""
+MOST_ROWS = 300
+"""Rows of a fit that show what their configurations determine and what is expected there."""
 
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """What a model expects of its own errors.
+    """What a model expects of the errors of its positions, without the noise of a measurement.
+
+    All are root mean square distances, m, of the ball if the model has one, else of all markers, or of the origins of
+    measured poses; without a measuring device after the best rigid motion.
 
     Args:
-        workspace: root mean square distance, m, between its positions of the last marker and the true ones over the
-            joint ranges of the rows; without a measuring device after the best rigid motion.
+        workspace: over the joint ranges of the rows, apart from the places of base and markers that the rows leave
+            open: after the best motion along these.
+        whole: the same with these places. measured: at the rows of the fit.
+        open_places: names of these places.
         size: standard deviation of the robot's size, relative. size_share: its part of ``workspace``, from 0 to 1.
+        doubt: distance, m, by which points move with a length that is in doubt; it is in ``workspace`` and ``whole``.
     """
 
     workspace: float
+    whole: float
+    measured: float
+    open_places: tuple[str, ...]
     size: float
     size_share: float
+    doubt: float = 0.0
 
     @classmethod
-    def of(cls, fitted: FittedMap) -> ExpectedError:
-        """That of a fitted map."""
-        points, at = fitted.geodesic.linearised_value(fitted.everywhere)
-        own = torch.eye(fitted.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
+    def of(cls, model: CalibratedKinematics) -> ExpectedError:
+        """That of a model."""
+        fitted, q, found = model.map, model.map.everywhere, OpenPlaces.of(model.map)
+        shown, own = _shown(model), fitted.unregistered
+        points, at = own.geodesic.linearised_value(q)
+        size = _deviation_of_size(own, points, at)
+        whole = _distance(shown @ fitted.posterior(q, noise=False)[1] @ shown.mT)
+        expected = whole
+        if found.motions.shape[1]:
+            left = found.without(fitted.joint_covariance(q))
+            expected = min(whole, _distance(shown @ _blocks(left, len(q)) @ shown.mT))
+        rows = _some_rows(fitted.x)
+        measured = _distance(shown @ fitted.posterior(fitted.x[rows], noise=False)[1] @ shown.mT)
         away = points[:, -3:] - points[:, -3:].mean(0)
-        covariance = fitted.covariance_between(at.projected(own))
-        weight = (away / away.square().sum()).flatten()
-        deviation = float((weight @ covariance @ weight).clamp(min=0).sqrt())
-        spread, expected = float(away.square().sum(1).mean().sqrt()), workspace_deviation(fitted)
-        return cls(expected, deviation, min(deviation * spread / max(expected, 1e-12), 1.0))
+        share = min(size * _length(away) / max(expected, 1e-12), 1.0)
+        return cls(expected, whole, measured, found.names_on(model), size, share)
+
+    def in_doubt(self, distance: float) -> ExpectedError:
+        """The same where a length in doubt moves points by a distance, m."""
+        wider = {name: hypot(getattr(self, name), distance) for name in ("workspace", "whole")}
+        return replace(self, **wider, doubt=distance)
+
+    @property
+    def sentence(self) -> str:
+        """How large it is, and what it leaves out."""
+        text = f"{1e3 * self.workspace:.3f} mm RMS"
+        if self.open_places:
+            what = f"{' and '.join(self.open_places)}, which the rows leave open"
+            text = f"{text} apart from {what} ({1e3 * self.whole:.3f} mm with it)"
+        doubt = f", {1e3 * self.doubt:.3f} mm of it by the length in doubt" * (self.doubt > 0)
+        return f"{text}{doubt}; {1e3 * self.measured:.3f} mm at the poses of the fit"
 
     def entry(self) -> dict[str, object]:
         """For programs."""
-        return {"expected_error_m": self.workspace, "size_deviation": self.size}
+        return {
+            "expected_error_m": self.workspace,
+            "with_open_places_m": self.whole,
+            "at_rows_of_fit_m": self.measured,
+            "open_places": list(self.open_places),
+            "size_deviation": self.size,
+        }
 
 
-def expected_errors(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> dict[str, float]:
-    """Root mean square distances, m, of the ball from its true places over the joint ranges of the rows, by stage.
+def expected_errors(
+    model: CalibratedKinematics,
+    stages: Mapping[str, Callable[[Tensor], Tensor]],
+    expected: ExpectedError | None = None,
+) -> dict[str, float]:
+    """Root mean square distances, m, of the positions of every stage from the true ones, by stage.
 
     sqrt(d^2 + s^2) with d the distance between the places of a stage and those of the model, and s the one that the
-    model expects of its own; without a measuring device after the best rigid motion.
+    model expects of its own, see :class:`ExpectedError`: both apart from what the rows leave open, and without a
+    measuring device after the best rigid motion.
 
     Args:
-        model: of rows in sockets or of readings.
-        stages: name -> kinematics, (N, n) -> (N, P, 3) in m, the ball last.
+        model: a calibrated model. stages: name -> kinematics, (N, n) -> (N, P, 3) in m.
+        expected: what it expects of its own errors, if that has been found already.
     """
-    fitted, own = model.map, workspace_deviation(model.map)
-    q = fitted.everywhere
-    places = model(q).detach()[:, -1]
+    fitted, found = model.map.unregistered, OpenPlaces.of(model.map)
+    own = (expected or ExpectedError.of(model)).workspace
+    q, shown = fitted.everywhere, _shown(model)
+    places = model(q).detach().flatten(1)
 
-    def expected(points: Tensor) -> float:
-        points = fitted.conditional.compared(points, places, rigid_fit)
-        return float(((points - places).square().sum(1).mean() + own**2).sqrt())
+    def from_truth(points: Tensor) -> float:
+        apart = found.left_of(points.flatten(1) - places) + places
+        apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
+        apart = fitted.conditional.compared(apart, targets, rigid_fit)
+        bodies = len(shown) // 3
+        return float(((apart - targets).square().sum() / (len(q) * bodies) + own**2).sqrt())
 
-    return {name: expected(kinematics(q).detach()[:, -1]) for name, kinematics in stages.items()}
+    return {name: from_truth(kinematics(q).detach()) for name, kinematics in stages.items()}
+
+
+def _shown(model: CalibratedKinematics) -> Tensor:
+    """(r, m) what expected errors are of: the ball if the model has one, else all markers, or origins of poses."""
+    every = model.bodies.averaging(model.map.new_noise)
+    by_device = device_coordinates(model.map.m, ball=model.ball, free=stands_free(model))
+    return every[-3:] if by_device < model.map.m else every
+
+
+def _distance(covariance: Tensor) -> float:
+    """Root mean square distance, m, of covariances (M, 3 P, 3 P), m^2."""
+    return float((3 * covariance.diagonal(dim1=1, dim2=2).mean()).clamp(min=0).sqrt())
+
+
+def _length(vectors: Tensor) -> float:
+    """Root mean square length of vectors (N, 3)."""
+    return float(vectors.square().sum(1).mean().sqrt())
+
+
+def _blocks(covariance: Tensor, count: int) -> Tensor:
+    """(M m, M m) -> (M, m, m) on the diagonal."""
+    return covariance.unflatten(0, (count, -1)).unflatten(2, (count, -1)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
+
+
+def _deviation_of_size(fitted: FittedMap, points: Tensor, at: Linearisation) -> float:
+    """Standard deviation of the robot's size, relative, by the last of its points (M, m)."""
+    own = torch.eye(fitted.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
+    away = points[:, -3:] - points[:, -3:].mean(0)
+    weight = (away / away.square().sum()).flatten()
+    return float((weight @ fitted.covariance_between(at.projected(own)) @ weight).clamp(min=0).sqrt())
+
+
+def _some_rows(x: Tensor) -> Tensor:
+    """Numbers of at most :data:`MOST_ROWS` evenly spaced rows."""
+    return torch.arange(0, len(x), -(-len(x) // MOST_ROWS), device=x.device)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenPlaces:
+    """Places of base and markers that rows leave open, although points elsewhere depend on them.
+
+    With S and S_0 the derivatives of the points anywhere and in the rows by these places, of deviations D, the
+    directions w of unit variance that |S D w|^2 = c^2 (|S_0 D w|^2 + noise^2) for a large c.
+
+    Args:
+        motions: (M m, k) of the points at the configurations of the workspace. names: (6 + 3 P, k) the directions.
+    """
+
+    motions: Tensor
+    names: Tensor
+
+    @classmethod
+    def of(cls, fitted: FittedMap) -> OpenPlaces:
+        """Those of a fitted map, by the rows of its registration if it has one."""
+        other = fitted.registration is not None and not fitted.registration.same
+        root, anywhere, rows = _registered_places(fitted) if other else _places(fitted)
+        A, B = ((S @ root) / S.shape[0] ** 0.5 for S in (anywhere, rows))
+        noise = fitted.new_noise.diagonal().mean()
+        factor = torch.linalg.cholesky(B.mT @ B + noise * torch.eye(B.shape[1], dtype=B.dtype, device=B.device))
+        white = torch.linalg.solve_triangular(factor, A.mT, upper=False)
+        ratios, vectors = torch.linalg.eigh(white @ white.mT)
+        open_ = vectors[:, ratios > OPEN_RATIO**2].flip(1)
+        directions = root @ torch.linalg.solve_triangular(factor.mT, open_, upper=True)
+        return cls(anywhere @ directions, directions)
+
+    def left_of(self, errors: Tensor) -> Tensor:
+        """Errors (M, m) at the workspace after the best motion along what is open."""
+        return self._without(errors.reshape(-1, 1)).view(errors.shape)
+
+    def without(self, covariance: Tensor) -> Tensor:
+        """The covariance (M m, M m) of errors after this motion."""
+        return self._without(self._without(covariance).mT)
+
+    def _without(self, columns: Tensor) -> Tensor:
+        basis, _ = torch.linalg.qr(self.motions)
+        return columns - basis @ (basis.mT @ columns)
+
+    def names_on(self, model: CalibratedKinematics) -> tuple[str, ...]:
+        """The places in words, each once: a marker that moves together with the base is what a turn would show."""
+        return tuple(dict.fromkeys(_name(direction, model) for direction in self.names.mT))
+
+
+MARKER_SHARE = 0.3
+"""Shift of a marker relative to that of the base from which the marker is named."""
+
+
+def _name(direction: Tensor, model: CalibratedKinematics) -> str:
+    """The place (6 + 3 P,) that is open, in words."""
+    base, markers = direction[:3], direction[6:].view(-1, 3)
+    number = int(markers.norm(dim=1).argmax()) if len(markers) else 0
+    if not len(markers) or float(markers[number].norm()) < MARKER_SHARE * float(base.norm()):
+        return "the place of the measuring frame"
+    what = model.bodies.name(number, len(model.geometry.on))
+    axis = "xyz"[int(markers[number].abs().argmax())]
+    return f"the place of the {what} on '{printable(model.geometry.on[number])}' along {axis}"
+
+
+def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
+    """Square root of the covariance of base and markers, and derivatives anywhere and in the rows, see the class."""
+    registration, fitted = model_map.registration, model_map.unregistered
+    nominal = fitted.geodesic.spec.nominal
+    own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
+    opened = fitted.open_directions[own]
+    conditional, q = fitted.conditional, fitted.everywhere
+    inner = conditional.conditional if isinstance(conditional, WithoutRigidMotions) else conditional
+    known = inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT
+    values, vectors = torch.linalg.eigh(known)
+    theta = q.new_zeros(nominal.parameters)
+    anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
+    if isinstance(conditional, WithoutRigidMotions):
+        turned = conditional.reference.sensitivity.flatten(0, 1)[:, conditional.base]
+        anywhere = anywhere - turned @ (conditional.fit @ anywhere)
+    root = vectors * values.clamp(min=0).sqrt()
+    if registration is not None:  # its rows may show what those of the fit left open
+        rows = nominal.sensitivities(registration.q.to(q), theta)[..., own]
+        return root, anywhere, rows.flatten(0, 1)
+    some = _some_rows(fitted.x)
+    rows = nominal.sensitivities(fitted.x[some], theta)[..., own]
+    rows = rows if fitted.slopes is None else fitted.slopes[some] @ rows
+    rows = rows * fitted.noise.visible[some, :, None]
+    return root, anywhere, _unshared(rows, fitted.noise.shared[some])
+
+
+def _unshared(rows: Tensor, shared: Tensor) -> Tensor:
+    """Derivatives (N, r, k) as (N r, k) without what devices that the rows share (N, r, c) would take up."""
+    flat, columns = rows.flatten(0, 1), shared.flatten(0, 1)
+    if not columns.shape[1]:
+        return flat
+    columns = columns / columns.norm(dim=0).clamp(min=1e-12)
+    return flat - columns @ torch.linalg.lstsq(columns, flat, rcond=1e-6, driver="gelsd").solution
+
+
+def _registered_places(fitted: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """The same where a registration found other markers."""
+    found = fitted.registration
+    values, vectors = torch.linalg.eigh(found.covariance.to(fitted.x))
+    return (vectors * values.clamp(min=0).sqrt(), *(fitted.place_slopes(q) for q in (fitted.everywhere, found.q)))
 
 
 STILL_RANGE = 0.05

@@ -10,14 +10,12 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.hidden_values import known, largest_known
-from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.common.quantiles import chi2_above, known, largest_known
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.bodies import Bodies, bodies_of
 from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
@@ -164,36 +162,35 @@ def found_outliers(
     """
     if not bool(bad.any()):
         return []
-    data = bodies_of(data).on_tips(model.on)
-    bodies = bodies_of(data)
+    data = data.bodies.on_tips(data, model.on)
+    labels = data.bodies.labels(data)
     predicted = model.at_payloads(data.payload)(data.q).detach()
     found = [
         Outlier(
             row,
-            bodies.number(body),
+            labels[body][0],
             int(data.line_numbers[row]),
             float(distances[row, body]),
             None if weights is None else float(weights[row, body]),
-            _reason(row, body, bodies, predicted, bad),
-            bodies.tip(body),
+            _reason(row, body, data, predicted, bad),
+            labels[body][1],
         )
         for row, body in bad.nonzero().tolist()
     ]
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
-def _reason(row: int, body: int, bodies: Bodies, predicted: Tensor, bad: Tensor) -> str:
+def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
     """Probable cause of an outlier, in words."""
-    data = bodies.data
     own = (predicted[row] - data.points[row]).norm(dim=-1)
     small = REMAINING_ERROR * float(known(own).max())
     seen = data.seen_bodies
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
-    other = _exchanged_with(row, body, bodies, predicted, small)
+    other = _exchanged_with(row, body, data, predicted, small)
     if other is not None:
         return f"markers {body} and {other} seem to be exchanged"
     if others and not bool(bad[row, others].any()):
-        return f"{bodies.name(body)} alone is off, the other {bodies.words} of this row fit"
+        return f"{data.body_names[body]} alone is off, the other {data.bodies.many} of this row fit"
     in_socket = data.other_socket(row, predicted, small)
     if in_socket is not None:
         return in_socket
@@ -209,12 +206,12 @@ def _reason(row: int, body: int, bodies: Bodies, predicted: Tensor, bad: Tensor)
     return FAR
 
 
-def _exchanged_with(row: int, body: int, bodies: Bodies, predicted: Tensor, small: float) -> int | None:
+def _exchanged_with(row: int, body: int, data: Measurements, predicted: Tensor, small: float) -> int | None:
     """The marker with which marker ``body`` of a row seems to be exchanged, if any."""
-    if bodies.count > MAX_MARKERS_FOR_EXCHANGE:
+    if data.seen_bodies.shape[1] > MAX_MARKERS_FOR_EXCHANGE:
         return None
-    for other in bodies.exchangeable:
-        errors = (predicted[row, [body, other]] - bodies.data.points[row, [other, body]]).norm(dim=-1)
+    for other in data.bodies.exchangeable(data):
+        errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
         if other != body and float(errors.max()) < small:
             return other
     return None

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Step, out_of_step
-from diffeo_calib.calibration.expected_errors import expected_of
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
-from diffeo_calib.common.quantiles import chi2_above, chi2_median
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     expected_covariance,
@@ -24,7 +23,6 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
 )
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
@@ -73,10 +71,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
     NaN for hidden markers.
     """
-    bodies = bodies_of(data)
-    mean, covariance = bodies.predicted(model.at_payloads(data.payload))
-    errors = bodies.errors(mean)
-    solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
+    found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+    errors = data.bodies.errors(data, found.points)
+    solved = torch.linalg.solve(found.covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
 
 
@@ -157,6 +154,32 @@ def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] |
     return place
 
 
+LARGE_PER_REACH, LARGE_PER_USUAL = 0.01, 20.0
+"""Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
+are no errors of a calibrated robot."""
+MOST_LARGE = 0.25
+"""Share of the rows from which such errors fail a fit."""
+
+
+def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:
+    """Raise MeasurementError if so many positions are far from a model that it holds for a part of the rows alone.
+
+    Args:
+        model: the fitted model. found: errors of positions, of rows that were held out if there are any.
+        usual: median error of the rows of the fit after a geometric calibration, m.
+    """
+    limit = max(LARGE_PER_REACH * model.robot.reach, LARGE_PER_USUAL * usual)
+    share = float((known(found.errors) > limit).double().mean())
+    if share > MOST_LARGE:
+        raise MeasurementError.of(
+            f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
+            expected="errors of a calibrated robot",
+            got=f"an RMS error of {1e3 * found.rms:.4g} mm",
+            fix="did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
+            "holds for a part of the rows at most",
+        )
+
+
 LARGE_PER_EXPECTED = 2.0
 """RMS errors from this multiple of the expected ones on are warned about."""
 
@@ -186,7 +209,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     """
     for table, _ in divided(data)[1]:
         devices = places.devices[sensor_key(table)]
-        away = devices.errors(table, model(table.q).detach()[:, -1]).norm(dim=1)
+        away = devices.errors(table, devices.points_of(model(table.q).detach())).norm(dim=1)
         if implausibly_far(model, float(away.median())):
             what, got = (
                 "these errors are not those of a calibrated robot",
@@ -282,5 +305,5 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
         raise InputError.of("a limit in px", expected="rows of images", got=", ".join(found), fix=fix)
     if not any(one.what == "errors" for one in own):
         of = "expected over the joint ranges of the fit, no position was measured"
-        measured.append(Accuracy(expected_of(model), unit, of))
+        measured.append(Accuracy(ExpectedError.of(model).whole, unit, of))
     return max(measured, key=lambda one: one.value)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from math import hypot
 from typing import Any
 
 from torch import Tensor
@@ -22,17 +21,17 @@ from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.places import Places, sensor_key
+from diffeo_calib.sensors.tables import with_positions
 
 STAGES = "nominal + registration", "geometry", "diffeomorphic"
 """Names of the stages of a calibration."""
@@ -114,14 +113,12 @@ class CalibrationResult:
     @cached_property
     def expected(self) -> ExpectedError:
         """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
-        found, worst = ExpectedError.of(self.model.map), doubtful(self.lengths)
-        if worst is None:
-            return found
-        return replace(found, workspace=hypot(found.workspace, worst.displacement * 3**0.5))
+        found, worst = ExpectedError.of(self.model), doubtful(self.lengths)
+        return found if worst is None else found.in_doubt(worst.displacement * 3**0.5)
 
-    def aligned(self, data: Measurements) -> Measurements:
-        """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
-        return self.placement.aligned(data)
+    def aligned(self, data: Any) -> Any:
+        """Rows of the same sessions in the frame of the model; those without positions, and of one session, stay."""
+        return with_positions(data, self.placement.aligned)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -150,7 +147,7 @@ class CalibrationResult:
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-        return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
+        return devices, devices.errors(data, devices.points_of(self.stages[stage](data.q).detach()))
 
     @property
     def left_out_rms(self) -> float:

@@ -3,6 +3,11 @@
     b' = ((1 + scale + stretch) x, (1 + scale - stretch) y, z + size (bend_x a^2 + bend_xy a b + bend_y b^2)),
 
 (a, b) = (x, y) / size from the board's middle, size half of its larger side, so that bends are deflections per size.
+
+Pinhole cameras with lens distortion: OpenCV's model (plumb bob) of five coefficients, and its derivatives.
+
+x = X / Z,  y = Y / Z,  s = x^2 + y^2,  g = 1 + k1 s + k2 s^2 + k3 s^3,
+u = fx (g x + 2 p1 x y + p2 (s + 2 x^2)) + cx,    v = fy (g y + p1 (s + 2 y^2) + 2 p2 x y) + cy.
 """
 
 from __future__ import annotations
@@ -51,3 +56,42 @@ def board_slopes(points: Tensor, size: float) -> Tensor:
 def _bends(points: Tensor, size: float) -> Tensor:
     a, b = points[..., 0] / size, points[..., 1] / size
     return torch.stack([a * a, a * b, b * b], -1)
+
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""Parameters of a lens: pixels for the first four."""
+
+
+def project(points: Tensor, lens: Tensor) -> Tensor:
+    """Pixels (..., 2) of points (..., 3) in the camera's frame, whose z axis looks ahead; lens (9,)."""
+    return _distorted(points, lens) * lens[:2] + lens[2:4]
+
+
+def project_slopes(points: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of pixels by the points (..., 2, 3), pixels per m, and by the lens (..., 2, 9)."""
+    k1, k2, p1, p2, k3 = lens[4:]
+    z = points[..., 2]
+    x, y = points[..., 0] / z, points[..., 1] / z
+    s, zero, one = x * x + y * y, torch.zeros_like(x), torch.ones_like(x)
+    g, slope = 1 + s * (k1 + s * (k2 + s * k3)), 2 * (k1 + s * (2 * k2 + 3 * s * k3))
+    across = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    by_x = torch.stack([g + slope * x * x + 2 * p1 * y + 6 * p2 * x, across], -1)
+    by_y = torch.stack([across, g + slope * y * y + 6 * p1 * y + 2 * p2 * x], -1)
+    by_point = torch.stack([by_x, by_y, -(by_x * x[..., None] + by_y * y[..., None])], -1) / z[..., None, None]
+    u, v = _distorted(points, lens).unbind(-1)
+    k = torch.stack([x * s, x * s**2, 2 * x * y, s + 2 * x * x, x * s**3], -1)
+    m = torch.stack([y * s, y * s**2, s + 2 * y * y, 2 * x * y, y * s**3], -1)
+    focal = lens[:2, None]
+    first = torch.stack([torch.stack([u, zero, one, zero], -1), torch.stack([zero, v, zero, one], -1)], -2)
+    return focal * by_point, torch.cat([first, focal * torch.stack([k, m], -2)], -1)
+
+
+def _distorted(points: Tensor, lens: Tensor) -> Tensor:
+    """Distorted tangents of angles (..., 2)."""
+    k1, k2, p1, p2, k3 = lens[4:]
+    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    s = x * x + y * y
+    g = 1 + s * (k1 + s * (k2 + s * k3))
+    return torch.stack(
+        [g * x + 2 * p1 * x * y + p2 * (s + 2 * x * x), g * y + p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1
+    )

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import BOARD, BoardPrior, board_slopes, real_board
-from diffeo_calib.cameras.lens import LENS, project, project_slopes
+from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
@@ -324,8 +323,8 @@ def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
         usual = (size.where(seen, size.new_tensor(torch.nan)).nanmedian(1).values / 1.1774).clamp(min=SMALLEST_NOISE_PX)
         inlier = seen & (size < OUTLIER * usual[:, None])
         squares, numbers = (size**2 * inlier).sum(1), 2.0 * inlier.sum(1)
-        spare = (numbers - 6).clamp(min=0)
-        level = squares.sum() / spare.sum().clamp(min=1.0)
+        spare = (numbers - 6).clamp(min=1.0)
+        level = (squares / spare).median()  # a usual image: few blurred ones do not count for all
         noise = ((squares + 2 * PRIOR_IMAGE_CORNERS * level) / (spare + 2 * PRIOR_IMAGE_CORNERS)).sqrt()[:, None]
     noise = noise.clamp(min=SMALLEST_NOISE_PX)
     return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)

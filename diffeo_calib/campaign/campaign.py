@@ -22,9 +22,8 @@ from diffeo_calib.campaign.model import CampaignModel
 from diffeo_calib.campaign.planned import Next, planned
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.table import Measurements

@@ -15,8 +15,8 @@ from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.campaign.verdicts import LIMITS, Change, Verdict, exchanged, find_change, measure
@@ -24,7 +24,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.measurements.bodies import origins
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.tree import Tree
@@ -295,7 +295,7 @@ def _compared(placed: Placed, target: Rows) -> Tensor:
     Without a measuring device rigid motions of all of them do not.
     """
     count = len(target)
-    whole = torch.block_diag(*origins(placed.lever, target.target).expand(count, -1, -1))
+    whole = torch.block_diag(*bodies_of(placed.lever).averaging(target.target).expand(count, -1, -1))
     if not placed.free:
         return whole
     points = target.at.task[0].points.view(count, -1, 3)

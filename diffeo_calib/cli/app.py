@@ -16,8 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from diffeo_calib.cli import campaign
-from diffeo_calib.cli.places import check_outputs
-from diffeo_calib.cli.record import record, remove_earlier
+from diffeo_calib.cli.record import check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import printable
 
 Command = TypeVar("Command", bound=Callable[..., None])

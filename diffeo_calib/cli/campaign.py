@@ -23,7 +23,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
 
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED
+from diffeo_calib.cli.console import EXIT_INTERRUPTED
 from diffeo_calib.common.errors import InputError, as_written
 
 if sys.version_info >= (3, 11):
@@ -76,7 +76,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LONGEST_FILE:
             raise InputError.of(f"{path}", expected="a file of options", got="more than 1 MiB")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -12,7 +12,7 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
-from diffeo_calib.cli.places import check_outputs, make_folder
+from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
 DEMO_ROWS = 300
@@ -44,13 +44,15 @@ def fit_command(
     fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     outputs = {"-o": output, "--figure": given.figure, "--report": given.report}
-    check_outputs(outputs, {"CSV": csv, "--robot": robot.robot})
+    others = given.scales_of or []
+    check_outputs(outputs, {"CSV": csv, "--robot": robot.robot} | {f"--scales-of {other}": other for other in others})
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
     links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
     files = fit.Outputs(output, given.figure, given.report)
     how = {"holdout": given.holdout, "seed": given.seed, "controls": given.controls, "note": given.note}
+    how["scales_of"] = others
     fit.run(links, measured_table(csv, rows, units, duplicates), files, **how)
 
 
@@ -194,7 +196,7 @@ def correct_command(
         Path,
         typer.Argument(metavar="PROGRAM", help="Table with a header, one command per row; other columns are kept."),
     ],
-    units: options.Units,
+    units: options.StoredUnits,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")],
     given: options.Correction,
 ) -> None:

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 
 from diffeo_calib.cli import declarations  # noqa: F401  # declares the commands
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 

@@ -11,8 +11,15 @@ from torch import Tensor
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import Rows, StoredUnits, Units
-from diffeo_calib.cli.tables import MeasuredTable, TableOptions, as_at_the_fit, measured_table, tool_frame
-from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.cli.tables import (
+    MeasuredTable,
+    TableOptions,
+    as_at_the_fit,
+    measured_table,
+    rows_in_table,
+    tool_frame,
+)
+from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
@@ -75,8 +82,16 @@ def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: StoredUnits
 
 
 def table_of(model: CalibratedKinematics, given: TableOptions) -> MeasuredTable:
-    """A table of measurements, read as that of the model's fit unless the options say otherwise."""
-    return measured_table(given.csv, *as_fitted(model, given.rows, given.units))
+    """A table of measurements, read as that of the model's fit unless the options say otherwise.
+
+    Kinds of rows of the fit that the table has no column of are left out.
+    """
+    rows, units = as_fitted(model, given.rows, given.units)
+    if not given.rows.named:
+        rows, missing = rows_in_table(given.csv, rows, units)
+        if missing:
+            say(f"the table has no columns of {few(missing)}: it is read without these rows of the fit")
+    return measured_table(given.csv, rows, units)
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:

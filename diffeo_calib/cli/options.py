@@ -267,6 +267,9 @@ class FitOptions:
     figure: Path | None = option("Also draw the errors (of the held-out rows, if any).", "IMAGE")
     report: Path | None = option("Also write the report: one page that needs neither a network nor a server.", "HTML")
     note: Note = ""
+    scales_of: list[Path] | None = option(
+        "Model of another robot of the same type, whose scales are used: for few rows. May be repeated.", "MODEL"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +282,7 @@ class LiveOptions:
     )
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
+    page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
     next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
     accepted: Path | None = option("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
 

@@ -10,7 +10,7 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
+from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.record import record
@@ -181,17 +181,20 @@ def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
         yield f"{between}: {1e3 * one.found:.3f} mm, known {1e3 * one.known:.3f}, error {1e3 * one.error:+.3f}"
 
 
-def stage_line(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> str:
+def stage_line(
+    model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]], expected: ExpectedError
+) -> str:
     """The absolute errors that a model expects of every stage; they go into the record too."""
-    found = expected_errors(model, stages)
+    found = expected_errors(model, stages, expected)
     record.add(expected_error_by_stage_m=found)
     listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in found.items())
     return f"expected absolute error by stage, in mm: {listed}"
 
 
-def expectation_lines(model: CalibratedKinematics, data: Any) -> Iterator[str]:
+def expectation_lines(model: CalibratedKinematics, data: Any, expected: ExpectedError | None = None) -> Iterator[str]:
     """The absolute error that a model expects, and which errors of the rows do not show it without a device."""
-    alone, expected = model.map.workspace is not None, 1e3 * workspace_deviation(model.map)
+    alone, expected = model.map.workspace is not None, expected or ExpectedError.of(model)
+    record.add(expected_error=expected.entry())
     fitted = ", after a rigid fit" * alone
-    yield f"expected absolute error over the joint ranges of the fit{fitted}: {expected:.3f} mm RMS"
-    yield from dict.fromkeys(part.flattery for part in data.parts * alone)
+    yield f"expected absolute error over the joint ranges of the fit{fitted}: {plain(expected.sentence)}"
+    yield from dict.fromkeys(part.flattery for part in (() if data is None else data.parts) * alone)

@@ -11,191 +11,47 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few
+from diffeo_calib.cli.guesses import (
+    LENS,
+    PAYLOADS,
+    SESSIONS,
+    SOME_LENS,
+    Sheet,
+    guess_column,
+    guess_deviations,
+    guess_positions,
+    guess_readings,
+    guess_rotation,
+    guess_sockets,
+)
+from diffeo_calib.cli.options import CORNERS, Rows
+from diffeo_calib.cli.tables import image_columns, reading_columns
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import number, read_cells
-from diffeo_calib.measurements.csv.files import read_observations, read_table
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.rotations import EULER
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.poses import numbers_of
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
+from diffeo_calib.sensors.tables import divided, measured_positions
 
-SEPARATORS = (",", ";", "\t", "|", " ")
-DECIMALS = (".", ",")
-ROWS = 50
-"""Rows that are looked at."""
-NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
-"""Parts of the names of columns that hold deviations or wishes, not measured places."""
-TURNS = ("rot", "euler", "quat", "ang")
-"""Parts of the names of columns that hold rotations."""
-UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE)
-"""Units that follow the name of a column."""
-
-
-PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
-"""A letter before x, y, z that says what they are: translation, position, measured."""
-READINGS = {
-    "distance": ("distance", "dist", "range", "bar"),
-    "displacement": ("displacement", "wire", "draw_wire", "interferometer"),
-    "height": ("height", "gauge", "dial", "dial_gauge", "indicator"),
-}
-"""Names of columns by the word of `fit --reading`."""
-SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
-PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
-ROTATIONS = (
-    ("qx", "qy", "qz", "qw"),
-    ("quat_x", "quat_y", "quat_z", "quat_w"),
-    tuple(f"r{row}{column}" for row in "123" for column in "123"),
-    tuple(f"r{row}{column}" for row in "012" for column in "012"),
-    ("rx", "ry", "rz"),
-    ("rot_x", "rot_y", "rot_z"),
-    ("rotvec_x", "rotvec_y", "rotvec_z"),
-    ("roll", "pitch", "yaw"),
-    ("euler1", "euler2", "euler3"),
-)
-"""Ends of the names of rotation columns."""
-DEVIATIONS = re.compile(r"(std_?dev|stdev|std|sigma|dev)")
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A table as it seems to be written.
-
-    Args:
-        sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
-        rows: how many rows were looked at.
-    """
-
-    sep: str
-    decimal: str
-    header: tuple[str, ...]
-    numbers: tuple[str, ...]
-    rows: int
-
-
-def guess_sheet(path: Path) -> Sheet:
-    """The separator and decimal mark with which most columns are numbers.
-
-    Raises:
-        MeasurementError: with none of them the file is a table of numbers.
-    """
-    found: list[Sheet] = []
-    for sep in SEPARATORS:
-        try:
-            header, lines = read_cells(path, sep)
-        except MeasurementError:
-            continue
-        rows = [cells for _, cells in lines[:ROWS]]
-        for decimal in DECIMALS:
-            if decimal == sep:
-                continue
-            columns = [k for k in range(len(header)) if all(number(row[k], decimal) is not None for row in rows)]
-            found.append(Sheet(sep, decimal, tuple(header), tuple(header[k] for k in columns), len(rows)))
-    best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
-    if best is None or not best.numbers:
-        fix = "check that the file has one header line, and the same number of cells in every line"
-        raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
-    return best
-
-
-def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
-    """Columns of the joints in the robot's order, and why; None if no reading of the names gives them all.
-
-    Names are compared as they are, without case, units and signs, and then as numbered series such as q1, q2, ...
-    """
-    for how, plain in (("named as in the URDF", str), ("named as in the URDF but for units and case", _bare)):
-        known = {plain(column): column for column in columns}
-        if len(known) == len(columns) and all(plain(joint) in known for joint in joints):
-            return [known[plain(joint)] for joint in joints], how
-    series: dict[str, dict[int, str]] = {}
-    for column in columns:
-        parts = re.fullmatch(r"(.*?)(\d+)(\D*)", column)
-        if parts is not None:
-            series.setdefault(f"{parts[1]}#{parts[3]}".lower(), {})[int(parts[2])] = column
-    for numbered in series.values():
-        for first in (0, 1):
-            wanted = range(first, first + len(joints))
-            if len(numbered) == len(joints) and set(numbered) == set(wanted):
-                return [numbered[k] for k in wanted], "numbered in the order of the URDF's joints"
-    return None
-
-
-def guess_positions(columns: Sequence[str]) -> list[list[str]]:
-    """Triples of columns whose names differ by x, y and z alone, in their order; no deviations, no targets."""
-    found: dict[str, dict[str, str]] = {}
-    no_place = (*NOT_MEASURED, *TURNS)
-    for column in [name for name in columns if not any(word in name.lower() for word in no_place)]:
-        for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
-            around = column[:place], column[place + 1 :]
-            before, after = PLACE.sub("", around[0]), around[1]
-            if not any(text and text[edge].isalpha() for text, edge in ((before, -1), (after, 0))):
-                found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
-    return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
-
-
-def guess_sockets(header: Sequence[str]) -> list[str] | None:
-    """The columns place and socket, or socket alone, that name where a ball rested; None without a socket."""
-    known = {name.lower(): name for name in header}
-    return [known[name] for name in ("place", "socket") if name in known] if "socket" in known else None
-
-
-def guess_reading(columns: Sequence[str]) -> tuple[str, str] | None:
-    """Word of `fit --reading` and the column of a device that measures one number, by its name; None without any."""
-    for word, known in READINGS.items():
-        for name in columns:
-            if UNITS.sub("", name).lower() in known:
-                return word, name
-    return None
-
-
-def guess_column(header: Sequence[str], words: Sequence[str]) -> str | None:
-    """The first column that has one of these names, but for case and units; None without one."""
-    return next((name for name in header if UNITS.sub("", name).lower() in words), None)
-
-
-def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:
-    """Columns of a rotation by their names: four of a quaternion, nine of a matrix or three angles; None without any.
-
-    Of several, those whose names begin as the position's do.
-    """
-    names = [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]
-    found: list[tuple[str, list[str]]] = []
-    for words in ROTATIONS:
-        by_prefix: dict[str, dict[str, str]] = {}
-        for name in names:
-            bare = UNITS.sub("", name).lower()
-            word = next((word for word in words if bare.endswith(word)), None)
-            if word is not None:
-                by_prefix.setdefault(bare.removesuffix(word), {})[word] = name
-        found += [
-            (before, [own[word] for word in words]) for before, own in by_prefix.items() if len(own) == len(words)
-        ]
-    start = position[0].lower()
-    return min(found, key=lambda entry: not start.startswith(entry[0]), default=(None, None))[1]
-
-
-def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
-    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
-    known: dict[str, str] = {}
-    for column in columns:
-        bare = DEVIATIONS.sub("", UNITS.sub("", column).lower())
-        if bare != UNITS.sub("", column).lower():
-            known[re.sub(r"[^a-z0-9]", "", bare)] = column
-    wanted = [_bare(name) for triple in triples for name in triple]
-    return [known[name] for name in wanted] if all(name in known for name in wanted) else None
-
-
-def _bare(name: str) -> str:
-    """A name without unit, case and signs."""
-    return re.sub(r"[^a-z0-9]", "", UNITS.sub("", name).lower())
-
-
+USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
+"""Widths and heights of images, pixels."""
+BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
+"""Of the ball on the tool by images, m."""
+FEWEST_IMAGES = 8
+"""Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 Entry = tuple[str, str | list[str] | bool, str]
 """An option, its value, and why."""
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
@@ -211,20 +67,25 @@ class RowColumns:
     """Columns of what was measured, by their names.
 
     Args:
-        markers: of positions. sockets: of place and socket. reading: word of `fit --reading` and column. session: of
-            the device or its set-up. payload: of the mass carried.
+        markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
+            or its set-up. payload: of the mass carried.
     """
 
     markers: list[list[str]]
     sockets: list[str]
-    reading: tuple[str, str] | None
+    readings: list[str]
     session: str | None
     payload: str | None
 
     @property
     def without_length(self) -> bool:
         """Whether no column is a length."""
-        return not self.markers and self.reading is None
+        return not self.markers and all(text.endswith(LENS) for text in self.readings)
+
+    @property
+    def of_boards(self) -> bool:
+        """Whether the rows are corners of a board in images."""
+        return any(text.startswith(CORNERS) for text in self.readings)
 
     def entries(self) -> Iterator[Entry]:
         """(option, value, why) of each."""
@@ -233,12 +94,20 @@ class RowColumns:
             yield "position", names, f"{len(names)} marker(s), by their names"
         if self.sockets:
             yield "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
-        if self.reading is not None:
-            yield "reading", "=".join(self.reading), "by its name; `displacement` is a distance with an unknown zero"
+        if self.readings:
+            why = "by names; `displacement` is a distance with an unknown zero"
+            why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels" * self.lens_missing
+            why += "; width and height of the images are the least usual size that holds all corners" * self.of_boards
+            yield "reading", self.readings[0] if len(self.readings) == 1 else self.readings, why
         if self.session is not None:
             yield "session", self.session, "by its name: the device, or its set-up, of every row"
         if self.payload is not None:
             yield "payload", self.payload, "by its name: the known mass that the robot carried"
+
+    @property
+    def lens_missing(self) -> bool:
+        """Whether the user is to fill in what no table holds."""
+        return any(text.endswith(LENS) for text in self.readings)
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
@@ -247,15 +116,34 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
     markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
     others = [name for name in sheet.numbers if name not in joints]
-    reading = None if markers or sockets else guess_reading(others)
-    if not markers and not sockets and reading is None:
+    readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
+    if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += 'column such as `distance`, `wire` or `height`; all options are in the README, "Without a tracker"'
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
     named = [name for name in sheet.header if name not in joints]
-    session = None if sockets else guess_column(named, SESSIONS)
-    return RowColumns(markers, sockets, reading, session, guess_column(others, PAYLOADS))
+    session = None if sockets and not readings else guess_column(named, SESSIONS)
+    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS))
+
+
+def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
+    """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
+    header, rows = read_cells(csv, sheet.sep)
+    if alone and {IMAGE, *POINT, *PIXEL} <= set(header):
+        return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
+    found = guess_readings(columns)
+    if alone and len(found) == 1:
+        return list(found)
+    empty = {name for k, name in enumerate(header) if any(not cells[k].strip() for _, cells in rows)}
+    return [text for text, own in found.items() if set(own) <= empty]
+
+
+def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> tuple[int, int]:
+    """The least usual size of images that hold all corners, pixels."""
+    places = [header.index(name) for name in PIXEL]
+    width, height = (max(number(cells[k], decimal) or 0.0 for _, cells in rows) for k in places)
+    return next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
 
 
 def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
@@ -268,7 +156,7 @@ def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str
 
 def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
-    if source.reading is not None:
+    if source.rows.readings:
         yield "", "", "beside readings no rotations and deviations were looked for"
     elif source.sockets:
         lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
@@ -300,81 +188,119 @@ class Source:
         """Columns of place and socket."""
         return tuple(self.rows.sockets)
 
-    @property
-    def reading(self) -> ReadingColumns | None:
-        """Columns of a device that measures one number."""
-        return None if self.rows.reading is None else reading_columns(self.rows.reading, self.rows.session)
+    def read(self, table: TableFormat) -> Any:
+        """The rows in another format, of any kinds.
 
-    def read(self, table: TableFormat) -> Measurements | None:
-        """The measurements in another format; None if they cannot be read so."""
+        Raises:
+            DiffeoCalibError: they cannot be read so.
+        """
+        columns = self._columns(table)
+        table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
+        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
+        data = data.with_joint_names(self.robot.joint_names)
+        return data.with_tips(self.tips) if self.tips else data
+
+    def positions(self, table: TableFormat) -> Measurements | None:
+        """The measured positions of the largest set-up; None if the table cannot be read so."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                data = read_table(self.csv, self.joints, self.markers, table, duplicates="keep", kinds=self.robot.kinds)
+                found = measured_positions(self.read(table))
             except DiffeoCalibError:
                 return None
-        data = data.with_joint_names(self.robot.joint_names)
-        return data.with_tips(self.tips) if self.tips else data
+        return None if found is None else found.largest_session()
+
+    def _columns(self, table: TableFormat) -> TableColumns:
+        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
+        texts = [text.replace(LENS, SOME_LENS) for text in self.rows.readings]
+        readings = [
+            image_columns(text, options) if text.startswith(CORNERS) else reading_columns(text, options.session)
+            for text in texts
+        ]
+        sockets = SocketColumns(self.sockets) if self.sockets else None
+        session = self.rows.session if self.markers else None
+        return TableColumns(self.joints, self.markers or None, sockets, tuple(readings), session, self.robot.kinds)
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
 
-        Of positions in m. Without any that of the ball in its socket, as a share of its spread over all rows, which is
-        small too where angles are read as too small. Infinite if the table cannot be read so.
+        Of positions of the largest set-up in m, else of readings in m. Without any that of the ball in its socket, or
+        of a camera's image, as a share of the spread over all rows, which is small too where angles are read as too
+        small. Infinite if the table cannot be read so.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                if self.reading is not None:
-                    return self._of_readings(table, self.reading)
-                return self._positions(table) if self.markers else self._in_sockets(table)
+                return self._residual(self.read(table))
             except DiffeoCalibError:
                 return inf
 
+    def _residual(self, data: Any) -> float:
+        positions = measured_positions(data)
+        if positions is not None:
+            return residual_of(self.robot, positions.largest_session())
+        own, readings = divided(data)
+        if own is not None:
+            return _in_sockets(self.robot, own.table)
+        tables = [one.table for one in readings]
+        lengths = [one for one in tables if one.kind != "image"]
+        if not lengths:
+            return max(_in_images(self.robot, one) for one in tables)
+        return identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
+
+    @property
+    def _in_metres(self) -> bool:
+        return not self.rows.without_length
+
     def size(self, residual: float) -> str:
         """A residual with its unit."""
-        return f"{1e3 * residual:.3g} mm" if self.markers or self.reading else f"{100 * residual:.3g} %"
+        return f"{1e3 * residual:.3g} mm" if self._in_metres else f"{100 * residual:.3g} %"
 
     def words(self, best: float, others: float) -> str:
         """What residuals say for the best units, and the least of those in other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-        what = "median residual of the nominal robot" if self.markers or self.reading else what
+        what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
+        what = "median residual of the nominal robot" if self._in_metres else what
         return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
 
-    def _positions(self, table: TableFormat) -> float:
-        if not self.sockets:
-            data = self.read(table)
-            return inf if data is None else residual_of(self.robot, data)
-        return residual_of(self.robot, self._with_sockets(table, self.markers).device_rows())
 
-    def _of_readings(self, table: TableFormat, reading: ReadingColumns) -> float:
-        """That of ball and devices around the nominal robot, from closed-form starts."""
-        columns = TableColumns(self.joints, readings=(reading,), kinds=self.robot.kinds)
-        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
-        found = identify_readings(Geometry.nominal(self.robot), [data], rigid=True)
-        return found.registration.rms
-
-    def _in_sockets(self, table: TableFormat) -> float:
-        data = self._with_sockets(table, None)
-        if data.socket is None:
-            return inf
-        found = register_sockets(self.robot, data.q, data.socket)
-        seen = found.positions[data.socket]
-        spread = float((seen - seen.mean(0)).norm(dim=1).median())
-        return float(found.distances.median()) / spread if spread > 0.0 else inf
-
-    def _with_sockets(self, table: TableFormat, markers: list[list[str]] | None) -> Measurements:
-        columns = TableColumns(self.joints, markers, SocketColumns(self.sockets), kinds=self.robot.kinds)
-        data = read_observations(self.csv, columns, table, duplicates="keep")
-        return data.with_joint_names(self.robot.joint_names)
+def _in_sockets(robot: Tree, data: Measurements) -> float:
+    """Median distance of the ball from the middle of its socket, as a share of its spread over all rows."""
+    if data.socket is None:
+        return inf
+    found = register_sockets(robot, data.q, data.socket)
+    seen = found.positions[data.socket]
+    spread = float((seen - seen.mean(0)).norm(dim=1).median())
+    return float(found.distances.median()) / spread if spread > 0.0 else inf
 
 
-def reading_columns(reading: tuple[str, str], device: str | None) -> ReadingColumns:
-    """The columns of a reading: word of `fit --reading` and column; ``device``: that names the device of a row."""
-    word, column = reading
-    if word == "displacement":
-        return ReadingColumns("distance", (column,), device, UNKNOWN_ZERO_M)
-    return ReadingColumns("height" if word == "height" else "distance", (column,), device)
+def _in_images(robot: Tree, data: Readings) -> float:
+    """Median distance of images from projections of the tool, as a share of their spread.
+
+    The ball on the tool is sought; lens and place of each camera are those of the best projection P, linear in its 12
+    numbers: P z ~ (u, v, 1).
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415  # slow to import
+
+    poses = robot(data.q)
+    rows = [data.device == device for device in range(len(data.names))]
+    if min(int(own.sum()) for own in rows) < FEWEST_IMAGES:
+        return inf
+
+    def share(ball: Any) -> float:
+        at = poses[:, :3, :3] @ poses.new_tensor(ball) + poses[:, :3, 3]
+        return max(_projection_error(at[own], data.reported[own]) for own in rows)
+
+    return float(minimize(share, [0.0] * 3, method="Nelder-Mead", options=BALL_SEARCH).fun)
+
+
+def _projection_error(points: Tensor, image: Tensor) -> float:
+    """Median distance of images (N, 2) from the best projection of points (N, 3), as a share of their spread."""
+    at = torch.cat([(points - points.mean(0)) / points.std(), torch.ones_like(points[:, :1])], 1)
+    seen = (image - image.mean(0)) / image.std()
+    matrix = [torch.cat([at * (k == 0), at * (k == 1), -seen[:, k : k + 1] * at], 1) for k in range(2)]
+    shown = at @ torch.linalg.svd(torch.cat(matrix), full_matrices=False).Vh[-1].view(3, 4).mT
+    return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
 def rotation(source: Source) -> Iterator[Entry]:
@@ -394,7 +320,7 @@ def rotation(source: Source) -> Iterator[Entry]:
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])]
     residuals: dict[tuple[str, str | None], float] = {}
     for convention, unit in product(conventions, units):
-        data = source.read(replace(source.table, rotation=columns, convention=convention, rotation_angle=unit))
+        data = source.positions(replace(source.table, rotation=columns, convention=convention, rotation_angle=unit))
         if data is not None:
             residuals[convention, unit] = residual_of(source.robot, data)
     (convention, unit), best = min(
@@ -426,7 +352,7 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
     residuals: dict[tuple[str, str, str, str | None], float] = {}
     for length, angle, convention, unit in product(("m", "mm"), ("rad", "deg"), conventions, turns):
         plain = TableFormat(length, angle, sheet.sep, sheet.decimal, names, convention, unit, camera_on_tool=True)
-        data = source.read(plain)
+        data = source.positions(plain)
         if data is not None:
             residuals[length, angle, convention, unit] = residual_of(source.robot, data)
     if not residuals:
@@ -450,7 +376,7 @@ def deviations(source: Source) -> Iterator[Entry]:
     names = guess_deviations(source.numbers, source.markers)
     if names is None:
         return
-    data = source.read(replace(source.table, std=names))
+    data = source.positions(replace(source.table, std=names))
     if data is None or data.std is None or float(data.std.nanmedian()) > LARGEST_DEVIATION:
         yield "", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used"
         return

@@ -23,6 +23,7 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
 from diffeo_calib.measurements.csv.images import ImageColumns, image_size
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
@@ -30,6 +31,7 @@ from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.kinds import known_kinds
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
@@ -132,6 +134,25 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
     return _completed(own, words), stated_units(_completed(units, words))
+
+
+def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
+    """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
+    header = set(read_cells(csv, units.sep)[0])
+    kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
+    kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
+    named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}
+    there = {kind: bool(names & header) for kind, names in named.items() if names}
+    if all(there.values()) or not any(there.values()):
+        return rows, []
+    missing = [kind for kind, has in there.items() if not has]
+    changes: dict[str, Any] = {} if rows.session in header else {"session": None}
+    if "--position" in missing:
+        changes |= {"position": None, "std": None, "rotation": None, "rotation_std": None}
+    if "--socket" in missing:
+        changes |= {"socket": None, "distance": None, "distance_std": None}
+    kept = [text for text in rows.reading or () if f"--reading {text}" not in missing]
+    return replace(rows, reading=kept or None, **changes), missing
 
 
 def stated_units(units: StoredUnits) -> Units:
@@ -417,6 +438,9 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
+    own = None if kind in (*KINDS, "image") else known_kinds().get(kind)
+    if own is not None and len(words) == own.numbers_each and all(words):
+        return ReadingColumns(kind, words, device, unit=own.unit)
     expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 

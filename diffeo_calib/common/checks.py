@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
+from diffeo_calib.common.data_frames import ARRAY_KINDS, real_array
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.common.real_numbers import ARRAY_KINDS, real_array
 
 MOST_SHOWN = 12
 """Values that a message lists."""

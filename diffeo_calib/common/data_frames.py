@@ -1,17 +1,21 @@
 """Data frames of pandas, polars and pyarrow: their columns by name. None of these libraries is imported to read them.
 
 Results become data frames of pandas, which is imported then and need not be installed otherwise.
+
+Objects as notebooks show them: small tables of names and values.
+
+Arrays that come from outside, as float64: all kinds that hold real numbers, and no other kind. NumPy alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
 
 from diffeo_calib.common.errors import InputError, listed
-from diffeo_calib.common.real_numbers import real_array
 
 
 def is_data_frame(value: object) -> bool:
@@ -101,3 +105,47 @@ def _numbers(frame: Any, name: str, what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError) as error:
         text = f"column {name!r} of the data frame `{what}` cannot be read as numbers ({error})"
         raise InputError.of(text, fix="convert it to numbers, and remove rows without a value") from error
+
+
+def facts_html(title: str, facts: Mapping[str, object]) -> str:
+    """A title over names and values."""
+    return table_html(title, (), [[name, str(value)] for name, value in facts.items()])
+
+
+def table_html(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A title over a table; the first cell of a row is its name."""
+    left, right = 'style="text-align:left"', 'style="text-align:right"'
+    head = "".join(f"<th {right if k else left}>{escape(name)}</th>" for k, name in enumerate(header))
+    lines = [
+        "".join(f"<td {right if k and header else left}>{escape(cell)}</td>" for k, cell in enumerate(row))
+        for row in rows
+    ]
+    body = "".join(f"<tr>{line}</tr>" for line in ([head] if head else []) + lines)
+    return f"<div><strong>{escape(title)}</strong><table>{body}</table></div>"
+
+
+ARRAY_KINDS = {
+    "b": "booleans",
+    "c": "complex numbers",
+    "m": "time differences",
+    "M": "dates",
+    "V": "records with named fields",
+}
+"""What NumPy would convert to numbers, or cut down to real ones, without a warning."""
+
+
+def real_array(value: object) -> np.ndarray:
+    """Convert anything but a tensor to a float64 array.
+
+    Raises:
+        TypeError, ValueError, OverflowError, RecursionError: no real numbers.
+    """
+    found = value if isinstance(value, np.ndarray) else np.asarray(value)
+    if found.dtype.kind in ARRAY_KINDS:
+        raise TypeError(ARRAY_KINDS[found.dtype.kind])
+    if isinstance(found, np.ma.MaskedArray) and bool(np.ma.getmaskarray(found).any()):
+        raise ValueError("masked values, which are missing")
+    if found.dtype == object and any(isinstance(entry, (bool, np.bool_, np.datetime64)) for entry in found.flat):
+        raise TypeError("objects that are no numbers")
+    # torch wants memory that may be written to, and forwards; columns of data frames are often read-only
+    return np.require(found, np.float64, ["C", "W", "E"])

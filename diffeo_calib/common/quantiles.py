@@ -1,9 +1,15 @@
 """Quantiles of values, and of the chi-square and F distributions.
 
 The latter are from `scipy.special`: `scipy.stats` takes half a second to import.
+
+Statistics of values some of which are missing: NaN in the place of what a hidden marker would have shown.
+
+Medians are torch's ``nanmedian``, means ``nanmean``.
 """
 
 from __future__ import annotations
+
+from math import inf
 
 import numpy as np
 import torch
@@ -44,3 +50,14 @@ def f_below(probability: float, upper: float, lower: float) -> float:
     from scipy.special import fdtri  # noqa: PLC0415  # see above
 
     return float(fdtri(upper, lower, probability))
+
+
+def largest_known(values: Tensor, dim: int = 1) -> Tensor:
+    """Largest value along an axis, NaN left out; NaN where there is nothing else."""
+    found = values.nan_to_num(-inf, posinf=inf).amax(dim)
+    return found.masked_fill(values.isnan().all(dim), float("nan"))
+
+
+def known(values: Tensor) -> Tensor:
+    """The values that are not NaN, in one row."""
+    return values[~values.isnan()]

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_finite
-from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
-from diffeo_calib.common.device import HOST, seeded, usable
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, seeded, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.maps.deformation import Deformation, Momenta, inverse_of
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -215,6 +214,29 @@ class FittedMap:
         """
         return self.conditional.covariance(at, directions)
 
+    def with_shifts(self, at: Linearisation, effects: Tensor, columns: Tensor) -> Tensor:
+        """Posterior covariance (M, r, r) of points together with shifts that rows of the fit shared.
+
+        Rigid motions that no device shows move the points and the shifts alike, and are no errors of their sum.
+
+        Args:
+            at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
+            columns: (c,) boolean, which of the shifts of the fit these are.
+        """
+        known = self.conditional
+        known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        own, shifts = known.features(at), known.shift_features()[:, columns]
+        signed = own.signs[:, None] * shifts  # (f, k)
+        with_shifts = (own.values.mT @ signed).view(*at.sensitivity.shape[:2], -1)
+        cross = with_shifts @ effects.mT
+        return known.posterior(at) + cross + cross.mT + effects @ (shifts.mT @ signed) @ effects.mT
+
+    @of_origin
+    def fitted_points(self) -> Tensor:
+        """(N, m) the map at the rows of the fit, each under its own payload, m."""
+        at_rows = self.geodesic.z1.view(-1, self.m) if self.data is None else self.geodesic(self.x)
+        return at_rows.detach()
+
     @of_origin
     def open_directions(self) -> Tensor:
         """Square root (K, k) of the prior covariance of theta in the k directions that the data leave open.
@@ -304,17 +326,17 @@ class FittedMap:
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
-        return self.conditional.posterior(self._parameters(which))[0]
+        return self.conditional.posterior(self.parameters_as_points(which))[0]
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
-        own, at = self._parameters(which), self.geodesic.linearise(x)
+        own, at = self.parameters_as_points(which), self.geodesic.linearise(x)
         between = self.covariance_between(at, own)  # (M m, k)
         known = self.conditional.posterior(own)[0]
         removed = (between * torch.linalg.solve(known, between.T).T).sum()
         return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
 
-    def _parameters(self, which: Tensor) -> Linearisation:
+    def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration."""
         at = self.geodesic.linearise(self.x[:1])
         nothing = at.sensitivity.new_zeros(1, len(which), at.sensitivity.shape[1])
@@ -324,6 +346,13 @@ class FittedMap:
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
         return self.conditional.covariance_between(at, other)
+
+    def joint_covariance(self, x: Tensor) -> Tensor:
+        """Posterior covariance of all coordinates of k1 at x (M, n) together: (M m, M m), m^2."""
+        points, at = self.geodesic.linearised_value(x)
+        return self.covariance_between(
+            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1))
+        )
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.

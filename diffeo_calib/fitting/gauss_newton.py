@@ -25,10 +25,9 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.objective import Objective
+from diffeo_calib.fitting.objective import Objective, linear_optimum
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, Stop, silent
-from diffeo_calib.fitting.tangent import linear_optimum
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation

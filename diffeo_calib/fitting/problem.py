@@ -17,11 +17,9 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
-from diffeo_calib.common.device import usable
+from diffeo_calib.common.device import methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.fitting.objective import Objective, Start
-from diffeo_calib.fitting.tangent import linear_optimum
+from diffeo_calib.fitting.objective import Objective, Start, linear_optimum
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend

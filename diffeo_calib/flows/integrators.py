@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.runtime.runge_kutta import MOST_STEPS, TABLEAUS
+from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS
 
 RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""

@@ -15,9 +15,9 @@ import torch
 from safetensors.torch import save as safetensors
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, printable
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.container import ENTRY, UNSOUND, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import (

@@ -13,15 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from diffeo_calib.common.data_frames import named_columns
+from diffeo_calib.common.data_frames import named_columns, real_array
 from diffeo_calib.common.errors import InputError, ModelFileError, as_written
-from diffeo_calib.common.real_numbers import real_array
 from diffeo_calib.interop.container import UNSOUND, Header, read_arrays
-from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import active_joints, calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import waves_of
 from diffeo_calib.runtime.program import FRAMES, Program
-from diffeo_calib.runtime.runge_kutta import MOST_STEPS, TABLEAUS
 
 
 class NumpyKinematics:

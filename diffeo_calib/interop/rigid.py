@@ -24,8 +24,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.identification.robust_registration import OffsetsAndPlaces, with_joint_offsets
+from diffeo_calib.calibration.identification.registration import OffsetsAndPlaces, register, with_joint_offsets
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

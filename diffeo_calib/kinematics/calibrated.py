@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, number_of
-from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.common.data_frames import data_frame, facts_html, is_data_frame
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
+from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
+from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
@@ -22,10 +22,12 @@ from diffeo_calib.kinematics.re_registration.register_again import devices_besid
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     directions_of_frames,
     frames_of_points,
+    kind_of_points,
     of_frames,
     own_blocks,
 )
@@ -34,9 +36,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.coordinates import check_joint_order
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 
 
 @methods_outside_inference_mode
@@ -57,6 +58,7 @@ class CalibratedKinematics:
         provenance: when the model was fitted, with what and to which table; None if that is not known.
         ball: whether the last marker is a ball whose position no device measured; so it is if none was measured at all.
         placement: devices of the fit in unknown places: measuring frames of sessions, sockets, devices of readings.
+        scales: scales of kernels, priors and noise as one vector, see ``Hyperparameters.vector``; None if unknown.
 
     Raises:
         InputError: a lever that is not positive, or one for a number of points that is no multiple of three; error
@@ -76,6 +78,7 @@ class CalibratedKinematics:
         provenance: Provenance | None = None,
         ball: bool = False,
         placement: tuple[PlacedDevices, ...] = (),
+        scales: Tensor | None = None,
     ) -> None:
         self.bodies = bodies_of(lever)
         self.bodies.check_points(map.m // 3)
@@ -90,6 +93,7 @@ class CalibratedKinematics:
         self.provenance = provenance
         self.ball = ball or map.workspace is not None
         self.placement = placement
+        self.scales = scales
 
     @property
     def has_tool(self) -> bool:
@@ -168,9 +172,9 @@ class CalibratedKinematics:
         Args:
             measurements: N configurations with markers or poses in the new measuring frame; of several sessions the
                 largest gives the frame, and the others are placed beside it. The number of markers may differ from that
-                of the fit, and there may be poses where there were markers or the other way round. Or a ball in
-                sockets, or readings, of a model of such rows: robot and ball stay, the new devices are placed around
-                them.
+                of the fit, and there may be poses where there were markers or the other way round. A ball in sockets,
+                or readings, of a model of such rows, alone or beside positions: the ball stays on the tool, and the
+                new devices are placed around the robot.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
                 decide between the same place, a small motion and other markers.
@@ -186,14 +190,15 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        rows = registration_rows(measurements)
+        rows = registration_rows(measurements, self)
         if rows is None:
             check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
-        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
-        device = self.configurations.device
-        seen = self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
+        ball = self.ball and bool(rows.points[:, -1].isnan().all())
+        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std, ball=ball)
+        known = {"map": found.to(self.configurations.device), "lever": found.registration.lever, "placement": ()}
+        seen = self._with(**known, ball=ball)._carrying(self.nominal.load)
         return seen._with(placement=devices_beside(seen, measurements))
 
     @property
@@ -266,7 +271,44 @@ class CalibratedKinematics:
         fitted = f"fitted to {len(self.configurations)} poses"
         return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, {fitted})"
 
-    _repr_html_, to_frame = model_html, predicted_frame
+    def _repr_html_(self) -> str:
+        """For notebooks: robot, measurements, errors at the fit and provenance."""
+        robot, made, found = self.robot, self.provenance, self.summary
+        facts: dict[str, object] = {
+            "robot": f"{printable(robot.name)}, {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints",
+            "measured": measured_words(self),
+            "rows of the fit": len(self.configurations),
+        }
+        if found is not None:
+            facts["geometric calibration, RMS"] = f"{1e3 * found.geometry_rms:.4f} mm on the rows of the fit"
+            facts["calibrated, RMS"] = f"{1e3 * found.leave_one_out_rms:.4f} mm, each row predicted by all others"
+        if self.registration is not None:
+            facts["registered anew"] = f"{self.registration.rows} rows, RMS {1e3 * self.registration.rms_after:.4f} mm"
+        if made is not None:
+            facts["fitted"] = f"{made.date[:10]} with version {made.version}, table sha256 {made.table_sha256[:12]}"
+            if made.note:
+                facts["note"] = printable(made.note)
+        return facts_html("Calibrated kinematics", facts)
+
+    def to_frame(self, q: Any) -> Any:
+        """Predicted markers with the standard deviations of a new measurement, as a pandas.DataFrame in m.
+
+        Args:
+            q: (N, n) joint values, rad or m, or a data frame, whose index is kept.
+
+        Returns:
+            columns x, y, z, std_x, std_y, std_z; marker1_x, ... with several markers, ball_x, ... of a ball beside
+            them. Poses: the origin of their frame, and a rotation vector rx, ry, rz [rad] with deviations about the
+            axes of the measuring frame; TIP_x, ... of several.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        found = self.bodies.predicted(self, q)
+        names = [f"{prefix}{name}" for prefix in self.bodies.prefixes(self) for name in found.names]
+        mean, std = found.mean.flatten(1), found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
+        columns = dict(zip([*names, *(f"std_{name}" for name in names)], [*mean.T, *std.T], strict=True))
+        return data_frame(columns, getattr(q, "index", None) if is_data_frame(q) else None)
 
     @property
     def configurations(self) -> Tensor:
@@ -346,6 +388,18 @@ class CalibratedKinematics:
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
 
+    def predict_readings(self, q: object, *, noise: bool = True) -> list[PredictedReadings]:
+        """What the devices of the fit will read of the ball: distances, heights, images, each in its unit.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new reading (default) or of the model alone.
+
+        Returns:
+            one entry for every device; none for a model whose devices measure positions or poses, see :meth:`predict`.
+        """
+        return predicted_readings(self, self._joints(q).detach(), noise=noise)
+
     def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
 
@@ -411,7 +465,12 @@ class CalibratedKinematics:
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
         names = ["robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball"]
-        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement"]} | changes)
+        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement", "scales"]} | changes)
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]
+
+
+def measured_words(model: Any) -> str:
+    """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
+    return kind_of_points(model.markers, model.lever)

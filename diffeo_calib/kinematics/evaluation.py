@@ -16,17 +16,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.bodies import Predicted
 from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import SESSION, Places
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -47,9 +47,9 @@ MOST_EXPECTED = 100
 def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | Evaluations:
     """Compare kinematics with measurements.
 
-    Devices that a model does not know are placed on the rows, and the result says how many numbers that took: the
-    frames of several set-ups, or of positions beside a model that was calibrated without a measuring device; the
-    devices of readings; the middles of sockets.
+    Rows of one set-up of the fit are compared in its frame. Devices that a model does not know are placed on the rows,
+    and the result says how many numbers that took: the frames of several set-ups, of a new one, or of positions beside
+    a model that was calibrated without a measuring device; the devices of readings; the middles of sockets.
 
     Args:
         kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring frame: a calibrated
@@ -121,7 +121,8 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
     unplaced = model is not None and model.map.workspace is not None and model.registration is None
     points = partial(_predicted, kinematics)
-    beside = Beside(points, devices_of(kinematics), unplaced=unplaced, every_session=every_session)
+    known = devices_of(kinematics), session_frames(kinematics)
+    beside = Beside(points, *known, unplaced=unplaced, every_session=every_session)
     parts = rows_of_one_kind(data)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
@@ -135,6 +136,12 @@ def devices_of(model: object) -> dict[str, Devices]:
     sets = getattr(model, "placement", None) or ()
     known = [own if isinstance(own, Devices) else getattr(own, "devices", None) for own in sets]
     return {own.kind: own for own in known if isinstance(own, Devices)}
+
+
+def session_frames(model: object) -> dict[str, Tensor]:
+    """Name of every set-up of positions that a model knows -> (4, 4) transform from its own frame to that one, m."""
+    sets = [own for own in getattr(model, "placement", None) or () if getattr(own, "kind", None) == SESSION]
+    return {name: T.view(4, 4) for own in sets for name, T in zip(own.names, own.constants, strict=True)}
 
 
 def placement_sentences(model: object) -> list[str]:

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.data_frames import table_html
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.common.notebook import table_html
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, payloads
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,

@@ -15,9 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     chosen_rows,
@@ -208,7 +207,8 @@ class Readings(RowTable):
         """Readings of devices of any kind, which sensors/kinds.py knows or which is registered there.
 
         Args:
-            kind: of the devices, such as "line distance".
+            kind: of the devices, such as "line distance"; "held tool" where two hands hold a rigid tool, six zeros a
+                row, see sensors/held_tool.py.
             q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
             devices: (N,) name of each row's device; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.
@@ -253,6 +253,14 @@ class Readings(RowTable):
     def reported_std(self) -> Tensor | None:
         """(N, r) known standard deviations of these, m or pixels."""
         return None if self.std is None else self.std * self.std.new_tensor(self.intrinsics[: self.std.shape[1]])
+
+    @property
+    def shown(self) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+        """Unit in which readings are shown, and what their r numbers are multiplied by and shifted by to be in it."""
+        r = self.values.shape[1]
+        if self.kind == "image":
+            return self.unit[0], self.intrinsics[:2], self.intrinsics[2:]
+        return self.unit[0], (self.unit[1],) * r, (0.0,) * r
 
     @property
     def sha256(self) -> str:

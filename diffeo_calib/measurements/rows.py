@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, check_seed
-from diffeo_calib.common.data_frames import data_frame
-from diffeo_calib.common.device import HOST, usable
+from diffeo_calib.common.data_frames import data_frame, table_html
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, printable, warn_user
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.common.notebook import table_html
 from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, unique_names, unlikely_si_joints
 
 if TYPE_CHECKING:

@@ -227,13 +227,6 @@ class SocketTable(RowTable):
         changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
         return with_attributes(shown, **changes)
 
-    def require_positions(self, what: str, fix: str = "") -> None:
-        """Raise MeasurementError for rows in sockets. what: what needs positions. fix: what to do instead."""
-        if self.sockets is not None:
-            got = "rows with a ball in sockets, whose places are not measured"
-            fix = fix if self.without_device else "pass the rows with measured positions alone: data.device_rows()"
-            raise MeasurementError.of(what, expected="measured positions", got=got, fix=fix)
-
 
 def socket_numbers(
     names: Sequence[str], rows: int, distances: Distances | None, distance_std: float | None

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.body_kinds import BodyKind, body_kind
+from diffeo_calib.measurements.bodies import Bodies, bodies_of
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
@@ -301,9 +300,9 @@ class Measurements(ImageTable, SocketTable):
         return seen
 
     @property
-    def body_kind(self) -> BodyKind:
+    def bodies(self) -> Bodies:
         """What the rows show: markers, or frames."""
-        return body_kind(self.lever)
+        return bodies_of(self.lever)
 
     @property
     def origins(self) -> Tensor:
@@ -313,7 +312,16 @@ class Measurements(ImageTable, SocketTable):
     @property
     def seen_bodies(self) -> Tensor:
         """(N, P) or (N, T) boolean: which markers, or measured frames, were seen."""
-        return self.visible if self.lever is None else self.visible[:, ::POINTS]
+        return self.visible[:, :: self.bodies.points]
+
+    @property
+    def body_kinds(self) -> Tensor | None:
+        """(N, B) int64, 1 for the ball in sockets beside bodies that a device saw, 0; None if all are of one kind."""
+        if self.sockets is None or self.without_device:
+            return None
+        found = torch.zeros(self.seen_bodies.shape, dtype=torch.int64, device=self.q.device)
+        found[:, -1] = 1
+        return found
 
     @property
     def body_names(self) -> list[str]:
@@ -443,16 +451,6 @@ class Measurements(ImageTable, SocketTable):
             return self
         largest = torch.bincount(self.session[self.session >= 0]).argmax()
         return self.rows(self.session == largest).with_sessions(None)
-
-    def check_one_set_up(self) -> None:
-        """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""
-        present = [] if self.session is None else [self.session_names[k] for k in self.session.unique() if k >= 0]
-        if len(present) > 1:
-            fix = (
-                "take those of one, register the model at those of another (`model.registered`), or bring those of "
-                "the fit into one frame (`result.aligned(data)`)"
-            )
-            raise MeasurementError.of("rows to compare a model with", expected="one set-up", got=few(present), fix=fix)
 
     def in_frames(self, transforms: Tensor) -> Measurements:
         """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.

@@ -34,9 +34,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError, as_written, sentence
-from diffeo_calib.fitting.objective import Objective, Start
+from diffeo_calib.fitting.objective import Objective, Start, tangent
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import Any
 
 from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -143,7 +143,9 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
     if len(found.predictions) >= sentences.ENOUGH_FOR_P95:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
-    if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
-        yield "expected in poses unlike the measured", f"{rough_millimetres(found.expected.rms)} mm"
+    error = found.expected.error
+    if error.whole > sentences.FAR_RATIO * error.measured:
+        apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
+        yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
     if found.repeats is not None and found.repeats.telling:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"

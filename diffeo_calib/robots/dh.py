@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import index_of
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import RobotError, as_written
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Chain, Ends, Tree
 

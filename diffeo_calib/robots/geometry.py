@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
+from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.joint import joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import right_jacobian, rigid, rotation, twist_transform
 from diffeo_calib.robots.tree import Tree

@@ -10,10 +10,15 @@ Markers are near the tip: c_k ~ N(0, 0.3 m). Without this prior a tool that hard
 an error of the robot of a millimetre, divided by a turn of a milliradian, is a metre. Such errors are common to many
 rows and do not average out, so that the prior weighs as much as all rows together. With tools that turn by a radian it
 moves the markers by less than a micrometre.
+
+What is known of the places of devices, bases and markers before any row is seen: one table of Gaussian priors.
+
+A shift and a turn that have one number are known to as many metres as radians.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import permutations, product
 from math import sqrt
 from typing import NamedTuple
@@ -21,8 +26,40 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
+
+
+@dataclass(frozen=True)
+class PlacePriors:
+    """Standard deviations.
+
+    Args:
+        marker_m: of a marker from the tip: no tool is larger.
+        open_base_m, open_base_rad: of a base about which the rows say nothing, around any place: a turn may be half of
+            one.
+        sought_base_m_rad: of a base or a measuring frame around the start of a search: no constraint.
+        found_m_rad: of a base, a marker, a device or a socket around the place where it was found: wide.
+        session_m_rad: of what remains between the frames of sessions after these were found.
+        remounted_m: of a marker between sessions, or since the fit: a tool that was mounted again.
+        same_m: of a marker that nobody touched since the fit. other_m: of another one, around where it was found.
+        same_registered_m, other_registered_m: the same two in a registration, around where the fit had the marker.
+    """
+
+    marker_m: float = 0.3
+    open_base_m: float = 5.0
+    open_base_rad: float = 2.0
+    sought_base_m_rad: float = 1.0
+    found_m_rad: float = 0.1
+    session_m_rad: float = 0.01
+    remounted_m: float = 1e-3
+    same_m: float = 5e-5
+    other_m: float = 0.1
+    same_registered_m: float = 1e-5
+    other_registered_m: float = 0.3
+
+
+PLACES = PlacePriors()
+
 
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""

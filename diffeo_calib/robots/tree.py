@@ -25,8 +25,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
+from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError, RobotError, as_written
-from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.joint import ROTARY, Joint, coupling, joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.runtime.build import ancestors_of, motion_terms

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree
 from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of

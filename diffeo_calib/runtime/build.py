@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.arrays import Array, Tableau
 from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
-from diffeo_calib.runtime.runge_kutta import Tableau
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")

@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, as_index
-from diffeo_calib.runtime.profiles import PROFILES
-from diffeo_calib.runtime.tables import JointTables
+from diffeo_calib.runtime.tables import PROFILES, JointTables
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""

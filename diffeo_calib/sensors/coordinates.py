@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -21,11 +21,21 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
-from diffeo_calib.sensors.placed import SESSION, SOCKET, PlacedDevices
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_sessions, placed, sensor_key
+from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.places import (
+    BALL_IS_THE_MARKER,
+    ROWS,
+    SESSION,
+    SOCKET,
+    PlacedDevices,
+    Places,
+    SessionPlaces,
+    place_sessions,
+    placed,
+    sensor_key,
+)
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -41,12 +51,14 @@ class Beside:
     Args:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
         devices: those of readings whose places are known, by kind.
+        frames: name of a set-up of positions -> (4, 4) transform from the frame of the kinematics to its own, m.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
     """
 
     points: Callable[[Any], Tensor]
     devices: Mapping[str, Devices]
+    frames: Mapping[str, Tensor] = field(default_factory=dict)
     unplaced: bool = False
     every_session: bool = False
 
@@ -89,7 +101,7 @@ class Positions(Sensor):
 
     def check(self, data: Measurements, model: Any) -> None:
         """The same kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
-        own, seen = bodies_of(model.lever), bodies_of(data.lever)
+        own, seen = model.bodies, data.bodies
         if own.kind != seen.kind:
             what = f"the model was calibrated with {own.kind}"
             raise InputError.of(what, expected=f"measured {own.kind}", got=seen.kind, fix=self.fix)
@@ -102,7 +114,10 @@ class Positions(Sensor):
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of several set-ups, or of rows that no device shares with the model."""
         names = {name for name in data.device_names if name}
-        if len(names) > 1 or (beside.every_session and names):
+        if len(names) == 1 and names <= set(beside.frames) and not beside.every_session:
+            (name,) = names
+            return Places(SessionPlaces((name,), beside.frames[name][None]))
+        if len(names) > 1 or ((beside.every_session or beside.frames) and names):
             frames = place_sessions(beside.points(data), data)
         elif beside.unplaced:
             frames = place_sessions(beside.points(data), data if names else data.with_sessions([ROWS] * len(data)))
@@ -153,7 +168,7 @@ class Poses(Positions):
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
         measured = whole_frames(data)
-        frames = frames_of_points(points, bodies_of(data.lever).pose_lever())
+        frames = frames_of_points(points, data.bodies.pose_lever())
         away = measured[..., :3, 3] - frames[..., :3, 3]
         angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
         angles = angles[:, 0] if angles.shape[1] == 1 else angles
@@ -203,10 +218,14 @@ class Contacts(Sensor):
 
 
 class OtherDevices(Sensor):
-    """Readings of the ball by other devices."""
+    """Readings of the ball, or of a frame of the tool, by other devices."""
 
     def check(self, data: Readings, model: Any) -> None:
-        """They tell of the ball alone."""
+        """They tell of the ball alone, or of the frame of measured poses."""
+        if kind_of(data).seen_points > 1:
+            model.bodies.pose_lever()
+            check_frames(data, model)
+            return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def with_points(self, data: Readings, model: Any) -> Readings:
@@ -221,7 +240,7 @@ class OtherDevices(Sensor):
         names = tuple(name for name in data.names if known is None or name not in known.names)
         new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
         rows = data.rows(new[data.device])
-        devices = placed(rows, beside.points(rows)[:, -1])
+        devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
         if known is not None:
             all_names, constants = (*known.names, *devices.names), torch.cat([known.constants, devices.constants])
@@ -238,7 +257,7 @@ class OtherDevices(Sensor):
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
         unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
-        away = per_unit * devices.in_unit(data, devices.errors(data, points[:, -1]))
+        away = per_unit * devices.in_unit(data, devices.errors(data, devices.points_of(points)))
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
@@ -247,14 +266,15 @@ class OtherDevices(Sensor):
 
     def settled(self, data: Readings, points: Tensor) -> tuple[PlacedDevices, ...]:
         """The devices, with the standard deviations of their increments."""
-        found = placed(data, points[:, -1])
-        rms = float(found.errors(data, points[:, -1]).norm(dim=1).square().mean().sqrt())
+        found = placed(data, points)
+        seen = found.points_of(points)
+        rms = float(found.errors(data, seen).norm(dim=1).square().mean().sqrt())
         if rms > LARGEST_RMS_M:
             fix = "recalibrate, which finds another ball; or check the rows"
             expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
             raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
-        deviations = found.open_deviations(data, points[:, -1])
-        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations),)
+        deviations = found.open_deviations(data, seen)
+        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
 
 
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}
@@ -273,13 +293,20 @@ def check_ball(model: Any, what: str, of: str, needed: str) -> None:
         raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
 
 
+def check_frames(data: Readings, model: Any) -> None:
+    """Raise InputError for readings of more frames than a model has."""
+    needed, known = kind_of(data).seen_points // model.bodies.points, model.markers // model.bodies.points
+    if needed > known:
+        raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
+
+
 def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
     """Raise MeasurementError if the measurements say that their points are on other tips than these of a model.
 
     Points whose tips are not named are those of the model, in its order.
     """
     if data.on is not None and data.on != own:
-        bodies = bodies_of(data.lever)
+        bodies = data.bodies
         what = f"the measurements' {bodies.many} are on other tips than the model's"
         expected, got = (listed(on[:: bodies.points]) for on in (own, data.on))
         raise MeasurementError.of(what, expected=expected, got=got, fix=f"put the {bodies.many} in its order")
@@ -292,7 +319,7 @@ def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
         MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
             say on which of them their markers are.
     """
-    bodies = bodies_of(data.lever)
+    bodies = data.bodies
     if data.on is not None and not set(data.on) <= set(robot.tips):
         what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {bodies.one}"
         got = listed(data.on[:: bodies.points])

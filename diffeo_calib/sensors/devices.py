@@ -1,23 +1,26 @@
-"""Devices that report numbers of a point on the tool: where they stand, what they see, and how they are found.
+"""Devices that report numbers of the tool: where they stand, what they see, and how they are found.
 
-A device has constants, which change by increments, such as shifts [m] and turns [rad]. What it reports is converted to
-metres at the point, so that errors of all kinds of readings are errors of positions. A new kind of device is a subclass
-of :class:`Devices` in a file of its own, named in sensors/kinds.py.
+A device sees a ball on the tool, or a frame of it. It has constants, which change by increments, such as shifts [m] and
+turns [rad]. What it reports is converted to metres, so that errors of all kinds of readings are errors of positions. A
+new kind of device is a subclass of :class:`Devices` in a file of its own, registered by sensors/kinds.py.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.pose_frames import POINTS, of_frames
+from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -49,6 +52,9 @@ class Effect(NamedTuple):
 class Devices(ABC):
     """The devices of some readings, all of one kind.
 
+    A kind says how a reading follows from constants (:meth:`read`) and how these change (:meth:`changed`); derivatives
+    are then found by torch. Or it has :meth:`observation` and :meth:`moved` with derivatives of its own.
+
     Args:
         names: D names. constants: (D, c). deviations: (k,) of the prior of the increments, m or rad.
     """
@@ -59,6 +65,14 @@ class Devices(ABC):
     """What to measure where readings of this kind hold too little length."""
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
+    seen_points: ClassVar[int] = 1
+    """Points of the tool that it sees: the ball, or three of each measured frame."""
+    numbers_each: ClassVar[int] = 1
+    """Numbers r of a reading."""
+    metres_each: ClassVar[float] = 1.0
+    """Metres at the tool that a unit of a reading counts as."""
+    unit: ClassVar[tuple[str, float]] = MILLIMETRES
+    """In which readings are shown and written, and how many of it are one; see :meth:`Readings.of`."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -66,8 +80,8 @@ class Devices(ABC):
 
     @classmethod
     @abstractmethod
-    def start(cls, values: Tensor, points: Tensor) -> Tensor:
-        """Constants (c,) of one device in closed form, from readings (N, r) of known points (N, 3), m."""
+    def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
+        """Constants (c,) of one device in closed form, from readings (N, r) of known bodies, see :meth:`bodies`."""
 
     @classmethod
     @abstractmethod
@@ -79,13 +93,35 @@ class Devices(ABC):
         """Constants (D, c) of devices from the numbers (D, k) that say where they are, see ``stated_as``; m."""
         raise InputError.of(f"a plan for devices of the kind {cls.kind!r}", fix="write its method `stated`")
 
-    @abstractmethod
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        """The reading (r,) of one device with constants (c,) of one body (3,) or (4, 4), see :meth:`bodies`."""
+        raise NotImplementedError
+
+    @staticmethod
+    def changed(constants: Tensor, increments: Tensor) -> Tensor:
+        """Constants (c,) of one device after increments (k,)."""
+        raise NotImplementedError
+
     def observation(self, device: Tensor) -> Observation:
         """What rows of these devices (N,) observe, m."""
+        return ReadPoints(type(self), self.constants[device], len(self.deviations))
 
-    @abstractmethod
     def moved(self, increments: Tensor) -> Devices:
         """The devices after increments (D, k)."""
+        return replace(self, constants=vmap(self.changed)(self.constants, increments))
+
+    @classmethod
+    def points_of(cls, points: Tensor) -> Tensor:
+        """The coordinates (N, 3 k) of what the devices see, of all points (N, P, 3) of a model."""
+        return points[:, -cls.seen_points :].flatten(1)
+
+    @classmethod
+    def bodies(cls, points: Tensor) -> Tensor:
+        """What the devices see by its coordinates (N, 3 k), m: balls (N, 3), a frame (N, 4, 4), or T (N, T, 4, 4)."""
+        if cls.seen_points == 1:
+            return points
+        return of_frames(poses_of_triangles(points.unflatten(1, (-1, POINTS, 3))))
 
     @classmethod
     def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:
@@ -163,9 +199,10 @@ class Devices(ABC):
 
     @classmethod
     def at(cls, data: Readings, points: Tensor) -> Devices:
-        """The devices of readings of known points (N, 3), m, in closed form."""
+        """The devices of readings of known points (N, 3 k), m, in closed form."""
         rows = [data.device == number for number in range(len(data.names))]
-        return cls.of(data, torch.stack([cls.start(data.values[own], points[own]) for own in rows]))
+        seen = cls.bodies(points)
+        return cls.of(data, torch.stack([cls.start(data.values[own], seen[own]) for own in rows]))
 
     @property
     def freedom(self) -> int:
@@ -175,7 +212,7 @@ class Devices(ABC):
     @property
     def metres(self) -> Tensor:
         """(D,) metres of displacement per unit of a reading."""
-        return torch.ones_like(self.constants[:, 0])
+        return torch.full_like(self.constants[:, 0], self.metres_each)
 
     def values(self, data: Readings) -> Tensor:
         """Readings (N, r) of devices under their names here, m.
@@ -199,7 +236,7 @@ class Devices(ABC):
 
     def distances(self, data: Readings, model: Callable[[Tensor], Tensor]) -> Tensor:
         """Absolute errors (N, 1), m, of a model of the ball: (N, n) joint values -> (N, 1, 3) m."""
-        return self.errors(data, model(data.q).detach()[:, -1]).norm(dim=1, keepdim=True)
+        return self.errors(data, self.points_of(model(data.q).detach())).norm(dim=1, keepdim=True)
 
     def in_unit(self, data: Readings, values: Tensor) -> Tensor:
         """Values (N, r) in m as readings in the unit in which these are shown."""
@@ -212,7 +249,7 @@ class Devices(ABC):
         return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
 
     def refined(self, data: Readings, points: Tensor) -> Devices:
-        """The places that fit readings of known points (N, 3), m, best, by reweighted least squares."""
+        """The places that fit readings of known points (N, 3 k), m, best, by reweighted least squares."""
         devices = self
         for _ in range(ROUNDS):
             errors, slopes = devices.errors(data, points), devices.shared(points, devices.numbers(data))
@@ -227,12 +264,55 @@ class Devices(ABC):
         return devices
 
     def open_deviations(self, data: Readings, points: Tensor) -> Tensor:
-        """(D, k) standard deviations of the increments, by the errors at known points (N, 3), m."""
+        """(D, k) standard deviations of the increments, by the errors at known points (N, 3 k), m."""
         errors, slopes = self.errors(data, points), self.shared(points, self.numbers(data)).flatten(0, 1)
         level = errors.square().mean().sqrt().clamp(min=SMALLEST_MEDIAN_M)
         eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
         covariance = torch.linalg.inv(slopes.mT @ slopes / level**2 + eye)
         return covariance.diagonal().clamp(min=0).sqrt().view(len(self.names), -1) * self.deviations
+
+
+class ReadPoints(Observation):
+    """What devices of a kind read of the tool: :meth:`Devices.read` of every row, with its derivatives, m.
+
+    Args:
+        kind: of the devices. own: (N, c) their constants. increments: k.
+    """
+
+    constants = ("own",)
+
+    def __init__(self, kind: type[Devices], own: Tensor, increments: int) -> None:
+        self.kind, self.own, self.increments = kind, own, increments
+
+    @property
+    def dim(self) -> int:
+        """3, or 9 of the points of a frame."""
+        return 3 * self.kind.seen_points
+
+    @property
+    def size(self) -> int:
+        """r."""
+        return self.kind.numbers_each
+
+    def _read(self, own: Tensor, points: Tensor) -> Tensor:
+        return self.kind.metres_each * self.kind.read(own, self.kind.bodies(points[None])[0])
+
+    def value(self, points: Tensor) -> Tensor:
+        """(N, r)."""
+        return vmap(self._read)(self.own, points)
+
+    def slope(self, points: Tensor) -> Tensor:
+        """(N, r, 3 k)."""
+        return vmap(jacrev(self._read, argnums=1))(self.own, points)
+
+    def by_constants(self, points: Tensor) -> Tensor:
+        """(N, r, increments)."""
+
+        def read(own: Tensor, at: Tensor, step: Tensor) -> Tensor:
+            return self._read(self.kind.changed(own, step), at)
+
+        zero = self.own.new_zeros(len(self.own), self.increments)
+        return vmap(jacrev(read, argnums=2))(self.own, points, zero)
 
 
 def check_devices(data: Readings) -> None:
@@ -254,10 +334,15 @@ def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     return found / scale
 
 
+def across(directions: Tensor) -> Tensor:
+    """Two unit vectors at right angles to each direction and to each other: (..., 3) -> (..., 2, 3)."""
+    return torch.linalg.svd(directions[..., None, :], full_matrices=True).Vh[..., 1:, :]
+
+
 def meeting_point(points: Tensor, directions: Tensor) -> Tensor:
     """The point (3,) nearest to lines through points (N, 3), m, along unit vectors (N, 3)."""
-    across = torch.eye(3, dtype=points.dtype, device=points.device) - directions[:, :, None] * directions[:, None]
-    return torch.linalg.lstsq(across.sum(0), (across @ points[:, :, None]).sum(0)).solution[:, 0]
+    off = torch.eye(3, dtype=points.dtype, device=points.device) - directions[:, :, None] * directions[:, None]
+    return torch.linalg.lstsq(off.sum(0), (off @ points[:, :, None]).sum(0)).solution[:, 0]
 
 
 def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:

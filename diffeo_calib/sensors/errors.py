@@ -9,12 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.data_frames import data_frame
+from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
-from diffeo_calib.common.hidden_values import known
-from diffeo_calib.common.notebook import table_html
-from diffeo_calib.common.quantiles import quantile
+from diffeo_calib.common.quantiles import known, quantile
 from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 
 NAMES = ("rms", "median", "p95", "max")

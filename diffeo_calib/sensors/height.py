@@ -18,9 +18,10 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.maps.observation import LinearFunctionals
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
     Devices,
+    across,
     least_squares,
     numbers_text,
     unit_least_squares,
@@ -76,8 +77,7 @@ class Planes(Devices):
 
     def moved(self, increments: Tensor) -> Devices:
         """Turned about two directions across the normal, those of :meth:`LinearFunctionals.by_constants`."""
-        across = torch.linalg.svd(self.constants[:, None, :3], full_matrices=True).Vh[:, 1:]
-        normals = self.constants[:, :3] + (across * increments[:, :2, None]).sum(1)
+        normals = self.constants[:, :3] + (across(self.constants[:, :3]) * increments[:, :2, None]).sum(1)
         normals = normals / normals.norm(dim=1, keepdim=True)
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
 

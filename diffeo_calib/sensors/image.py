@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,

@@ -1,18 +1,26 @@
 """Every kind of device, by the kind of its readings: the only place that knows them all.
 
-A kind of your own is a subclass of :class:`Devices`, given to :func:`register`, as in scripts/examples/laser_line.py.
+A kind of your own is a subclass of :class:`Devices`, given to :func:`register`: see scripts/examples/laser_line.py and
+inclinometer.py. The command line knows it if a package that is installed names its module as an entry point of
+``diffeo_calib.sensors``; tables then have ``--reading KIND=COLUMN,...``.
 """
 
 from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import entry_points
 
 from diffeo_calib.common.errors import InputError, MeasurementError, listed
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
+from diffeo_calib.sensors.held_tool import HeldTools
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.range import FixedPoints
 
-KINDS: dict[str, type[Devices]] = {kind.kind: kind for kind in (FixedPoints, Planes, Cameras)}
+KINDS: dict[str, type[Devices]] = {kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools)}
+
+GROUP = "diffeo_calib.sensors"
 
 
 def register(kind: type[Devices]) -> type[Devices]:
@@ -31,9 +39,21 @@ def register(kind: type[Devices]) -> type[Devices]:
     return kind
 
 
+@cache
+def _load_installed() -> None:
+    for found in entry_points(group=GROUP):
+        found.load()
+
+
+def known_kinds() -> dict[str, type[Devices]]:
+    """All kinds by their names, those of installed packages too."""
+    _load_installed()
+    return KINDS
+
+
 def kind_of(data: Readings) -> type[Devices]:
     """The kind of the devices of some readings; MeasurementError for one that nobody registered."""
-    if data.kind not in KINDS:
+    if data.kind not in known_kinds():
         fix = "register its class with `diffeo_calib.sensors.kinds.register`"
         raise MeasurementError.of("the kind of readings", expected=listed(list(KINDS)), got=repr(data.kind), fix=fix)
     return KINDS[data.kind]

@@ -1,4 +1,7 @@
-"""Where devices stand beside a model: measuring frames of set-ups, and devices of readings, placed on judged rows."""
+"""Where devices stand beside a model: measuring frames of set-ups, and devices of readings, placed on judged rows.
+
+Where the devices of a calibration were found: what a model keeps of them.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.sensors.devices import Devices, check_devices
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera
+from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
+from diffeo_calib.sensors.kinds import kind_of, known_kinds
 
 FEWEST_ROWS = 4
 """Rows of a session from which its frame is found."""
@@ -150,15 +155,143 @@ def sensor_key(data: Readings) -> object:
     return data.kind, data.offset_std, data.intrinsics
 
 
+def fitting_devices(data: Readings, points: Tensor) -> Devices:
+    """The devices where they fit readings best, for known points (N, P, 3) of the tool, m."""
+    kind = kind_of(data)
+    seen = kind.points_of(points)
+    return kind.at(data, seen).refined(data, seen)
+
+
 def placed(data: Readings, points: Tensor) -> Devices:
-    """The devices where they fit readings of known points (N, 3), m, best.
+    """The same for rows that a user passes.
 
     Raises:
         MeasurementError: too few rows of a device, or readings that no place of it explains.
     """
     check_devices(data)
     try:
-        return kind_of(data).at(data, points).refined(data, points)
+        return fitting_devices(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         fix = "check the columns of the readings, their unit, and which device each row names"
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None
+
+
+SESSION, SOCKET = "session", "socket"
+"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
+MODEL_FRAME = "the frame of the model"
+ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
+Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
+"""Unit in which r numbers are shown, and what they are multiplied by and shifted by to be in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedDevices:
+    """Devices of one kind in the frame of a model.
+
+    Args:
+        kind: "session", "socket", or that of readings.
+        names: D names. constants: (D, c). deviations: (D, k) standard deviations of their increments, m or rad.
+        rows: (M,) int64, rows of the fit that they measured. device: (M,) int64, which of them did.
+        shown: how their readings are shown; None for other kinds, and in files of old versions.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    constants: Tensor
+    deviations: Tensor
+    rows: Tensor
+    device: Tensor
+    shown: Shown | None = None
+
+    @classmethod
+    def outside(
+        cls, kind: str, names: tuple[str, ...], constants: Tensor, deviations: Tensor, shown: Shown | None = None
+    ) -> PlacedDevices:
+        """Devices that measured no row of the fit."""
+        nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
+        return cls(kind, names, constants, deviations, nothing, nothing, shown)
+
+    def beside(self, other: PlacedDevices) -> PlacedDevices:
+        """These, and those of the same kind with other names."""
+        kept = [number for number, name in enumerate(other.names) if name not in self.names]
+        known = {number: len(self.names) + place for place, number in enumerate(kept)}
+        rows = torch.tensor([number in known for number in other.device.tolist()], dtype=torch.bool, device=HOST)
+        device = [known[number] for number in other.device[rows].tolist()]
+        return PlacedDevices(
+            self.kind,
+            (*self.names, *(other.names[number] for number in kept)),
+            torch.cat([self.constants, other.constants[kept]]),
+            torch.cat([self.deviations, other.deviations[kept]]),
+            torch.cat([self.rows, other.rows[rows]]),
+            torch.cat([self.device, torch.tensor(device, dtype=torch.int64, device=HOST)]),
+            self.shown or other.shown,
+        )
+
+    @property
+    def devices(self) -> Devices | None:
+        """As devices of readings; None for other kinds, and for those that nobody registered."""
+        if self.kind not in known_kinds():
+            return None
+        return known_kinds()[self.kind](self.names, self.constants, self.deviations.amax(0))
+
+    @property
+    def camera(self) -> BoardCamera | None:
+        """As the camera that saw a board; None for other kinds."""
+        return BoardCamera.of(self.constants[0]) if self.kind == CAMERA else None
+
+    def sentences(self) -> list[str]:
+        """Where each of them is in the frame of the model, with standard deviations; lens and board of a camera."""
+        if self.kind == CAMERA:
+            return [] if self.camera is None else list(self.camera.sentences())
+        devices = self.devices
+        if devices is not None:
+            return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        places = (
+            self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
+        )  # of transforms, row by row
+        return [
+            f"{self.kind} '{name}': {numbers_text((1e3 * place).tolist())} mm in {MODEL_FRAME}"
+            for name, place in zip(self.names, places, strict=True)
+        ]
+
+    @property
+    def shown_as(self) -> Shown:
+        """How readings are shown, for files of old versions as the devices report them, lengths in m."""
+        return self.shown or ("", (1.0,), (0.0,))
+
+    def entry(self) -> dict[str, Any]:
+        """For a file, in m and rad."""
+        found = {name: getattr(self, name) for name in ENTRIES} | ({} if self.shown is None else {"shown": self.shown})
+        return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
+
+    @classmethod
+    def from_entry(cls, entry: Any, rows: int) -> PlacedDevices:
+        """The inverse of :meth:`entry`, for a fit of so many rows.
+
+        Raises:
+            InputError: entries that do not fit together.
+        """
+        if not isinstance(entry, dict) or set(entry) - {"shown"} != set(ENTRIES):
+            raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
+        if not isinstance(entry["kind"], str):
+            raise InputError.of("the kind of the devices of a model", expected="a text", got=entry["kind"])
+        names = tuple(map(str, entry["names"]))
+        deviations = torch.tensor(entry["deviations"], dtype=torch.float64, device=HOST).view(len(names), -1)
+        constants = as_tensor(entry["constants"], "placement", (len(names), "c"))
+        numbers, device = (torch.tensor(entry[name], dtype=torch.int64, device=HOST) for name in ("rows", "device"))
+        inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
+        if len(numbers) != len(device) or not inside:
+            raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
+        return cls(entry["kind"], names, constants, deviations, numbers, device, _shown(entry.get("shown")))
+
+
+def _shown(entry: Any) -> Shown | None:
+    """The inverse of the entry of :attr:`PlacedDevices.shown`."""
+    if entry is None:
+        return None
+    try:
+        unit, scale, zero = entry
+        return str(unit), tuple(map(float, scale)), tuple(map(float, zero))
+    except (TypeError, ValueError):
+        expected = "a unit, factors and zeros"
+        raise InputError.of("how readings of a model are shown", expected=expected, got=repr(entry)) from None

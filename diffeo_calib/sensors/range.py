@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, Effect, least_squares, meeting_point, numbers_text
 
 FIXED_DEVIATION_M = 1e-9

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.observations import unmixed
-from diffeo_calib.measurements.pose_frames import kind_of_points, points_of_frames
+from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.measurements.observations import Observations, unmixed
+from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.kinds import kind_of
 
 ORDER = {"position": 0, "pose": 0, "socket": 1}
 
@@ -94,7 +95,11 @@ class Shown(NamedTuple):
 def check_markers(model: Shown, own: Coordinates | None, readings: Sequence[OtherReadings]) -> None:
     """Raise InputError for rows that show other markers than a model."""
     table = None if own is None else own.table
-    if model.lever is not None and (readings or (table is not None and table.sockets is not None)):
+    frames = [one.table.kind for one in readings if sees_frame(one.table)]
+    if model.lever is None and frames:
+        raise InputError.of(f"{frames[0]}s", expected="a model of poses", got="one of markers", fix=model.other)
+    balls = len(frames) < len(readings)
+    if model.lever is not None and (balls or (table is not None and table.sockets is not None)):
         fix = "measure poses again, or calibrate again with all rows"
         raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
     if table is None or table.without_device:
@@ -112,6 +117,12 @@ def measured_positions(data: Any) -> Measurements | None:
     return None if own is None or own.table.without_device else own.table.device_rows()
 
 
+def with_positions(data: Any, change: Callable[[Any], Any]) -> Any:
+    """Any table with a change of its rows whose positions or poses a device measured; the other ones stay."""
+    parts = [own if own.without_device else change(own) for own in data.parts]
+    return Observations(parts, data.index) if len(parts) > 1 else parts[0]
+
+
 def device_coordinates(coordinates: int, *, ball: bool, free: bool) -> int:
     """How many of a model's coordinates a device of positions sees: not those of a ball beside other markers."""
     return coordinates - 3 if ball and not free and coordinates > 3 else coordinates
@@ -123,9 +134,35 @@ def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: 
     return next((tip for table in tables if (tip := table.ball_tip) is not None), usual)
 
 
+SMALLEST_LEVER_M, LARGEST_LEVER_M = 0.01, 3.0
+"""Distances of the points of a pose with which positions and turns of a robot's tool both count."""
+
+
+def sees_frame(table: Any) -> bool:
+    """Whether rows are readings of a frame of the tool, not of a ball."""
+    return isinstance(table, Readings) and kind_of(table).seen_points > 1
+
+
 def check_poses(data: Any) -> None:
-    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
-    kinds = dict.fromkeys(part.kind for part in data.parts)
+    """Raise MeasurementError for poses beside rows with a ball, whose poses no model knows, and for odd levers.
+
+    Readings of frames need poses beside them.
+    """
+    for lever in (getattr(part, "lever", None) for part in data.parts):
+        if lever is not None and not SMALLEST_LEVER_M <= lever <= LARGEST_LEVER_M:
+            expected = f"{1e3 * SMALLEST_LEVER_M:g} to {1e3 * LARGEST_LEVER_M:g} mm, about the size of the tool"
+            fix = "pass it in m (on the command line in the unit of lengths), or leave it out"
+            raise MeasurementError.of("`lever`", expected=expected, got=f"{1e3 * lever:g} mm", fix=fix)
+    kinds = dict.fromkeys(part.kind for part in data.parts if not sees_frame(part))
+    frames = dict.fromkeys(part.kind for part in data.parts if sees_frame(part))
+    if frames and "pose" not in kinds:
+        fix = "measure poses too, which tell where the frame is on the tool and how large the robot is"
+        raise MeasurementError.of(f"{few(list(frames))}s", expected="rows beside measured poses", got="none", fix=fix)
+    most = max((kind_of(part).seen_points for part in data.parts if sees_frame(part)), default=0)
+    shown = sum(part.markers for part in data.parts if part.kind == "pose")
+    if most > shown:
+        expected, got = f"poses of {most // POINTS} frames beside them", shown // POINTS
+        raise MeasurementError.of(f"{few(list(frames))}s", expected=expected, got=got, fix="measure all of them")
     if "pose" in kinds and len(kinds) > 1:
         got = " and ".join(f"{kind}s" for kind in kinds)
         fix = "give the positions of the poses alone (leave their rotation out)"

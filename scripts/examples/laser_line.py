@@ -7,52 +7,14 @@ Registered, it is fitted, evaluated and written like the package's own, beside m
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.maps.observation import Observation
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.sensors.devices import Devices, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
 from diffeo_calib.sensors.kinds import register
-
-
-class LineDistances(Observation):
-    """h(z) = |(I - d d^T) (z - p)|: distances from lines through p (N, 3) along the unit vectors d (N, 3), m.
-
-    Increments of its constants: shifts of p along two directions across d, then turns of d towards these.
-    """
-
-    constants = ("point", "direction")
-
-    def __init__(self, point: Tensor, direction: Tensor) -> None:
-        self.point, self.direction = point, direction
-
-    size = 1  # pyright: ignore[reportAssignmentType]
-
-    def value(self, points: Tensor) -> Tensor:
-        """(N, 1)."""
-        return torch.linalg.cross(points - self.point, self.direction).norm(dim=1, keepdim=True)
-
-    def slope(self, points: Tensor) -> Tensor:
-        """Unit vectors from the line: (N, 1, 3)."""
-        away = points - self.point
-        away = away - (away * self.direction).sum(1, keepdim=True) * self.direction
-        return torch.nn.functional.normalize(away, dim=1)[:, None]
-
-    def by_constants(self, points: Tensor) -> Tensor:
-        """(N, 1, 4)."""
-        shifts = -(self.slope(points) @ across(self.direction).mT)
-        along = ((points - self.point) * self.direction).sum(1)
-        return torch.cat([shifts, along[:, None, None] * shifts], 2)
-
-
-def across(direction: Tensor) -> Tensor:
-    """Two unit vectors across each direction: (N, 3) -> (N, 2, 3)."""
-    return torch.linalg.svd(direction[:, None], full_matrices=True).Vh[:, 1:]
 
 
 @register
@@ -68,38 +30,34 @@ class Beams(Devices):
         """Of two shifts and two turns."""
         return [PLACES.found_m_rad] * 4
 
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        """|(z - p) x d|."""
+        point, direction = constants.split(3)
+        return torch.linalg.cross(body - point, direction, dim=0).norm()[None]
+
+    @staticmethod
+    def changed(constants: Tensor, increments: Tensor) -> Tensor:
+        """Shifted and turned across the beam."""
+        point, direction = constants.split(3)
+        shift, turn = increments.view(2, 2) @ across(direction)
+        return torch.cat([point + shift, torch.nn.functional.normalize(direction + turn, dim=0)])
+
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """Points and directions of any length."""
         return torch.cat([numbers[:, :3], torch.nn.functional.normalize(numbers[:, 3:], dim=1)], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
-        """All slopes are across the beam, and lead away from it."""
-        direction = torch.linalg.svd(slopes[:, 0]).Vh[2]
-        normals = torch.linalg.cross(slopes[:, 0], direction.expand(len(points), 3))
-        return cls.stated(torch.cat([least_squares(normals, (normals * points).sum(1)), direction])[None])[0]
-
-    @classmethod
-    def start(cls, values: Tensor, points: Tensor) -> Tensor:
+    def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
         """z^T A z - 2 b.z + c = h^2 is linear in A = I - d d^T, b = A p and c."""
-        middle = points.mean(0)
-        x, y, z = (points - middle).unbind(1)
+        middle = bodies.mean(0)
+        x, y, z = (bodies - middle).unbind(1)
         columns = x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, -2 * x, -2 * y, -2 * z, torch.ones_like(x)
         found = least_squares(torch.stack(columns, 1), values[:, 0] ** 2)
         A = found[[0, 3, 4, 3, 1, 5, 4, 5, 2]].view(3, 3)
         vectors = torch.linalg.eigh(A).eigenvectors
         return torch.cat([middle + vectors[:, 1:] @ (vectors[:, 1:].mT @ found[6:9]), vectors[:, 0]])
-
-    def observation(self, device: Tensor) -> LineDistances:
-        """Distances."""
-        return LineDistances(self.constants[device, :3], self.constants[device, 3:])
-
-    def moved(self, increments: Tensor) -> Devices:
-        """Shifted and turned across the beam."""
-        shifts, turns = (increments.view(-1, 2, 2, 1) * across(self.constants[:, 3:])[:, None]).sum(2).unbind(1)
-        direction = torch.nn.functional.normalize(self.constants[:, 3:] + turns, dim=1)
-        return replace(self, constants=torch.cat([self.constants[:, :3] + shifts, direction], 1))
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Point and direction."""

@@ -9,7 +9,7 @@ orientations. Here the poses are simulated; from a table they are read by
                          rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
 
 A camera on the tool that sees a fixed board measures poses of the board: read them with `camera_on_tool=True`, and
-`diffeo_calib.kinematics.hand_eye.HandEye.of(result.model)` has camera and board with their deviations.
+`diffeo_calib.kinematics.tool.HandEye.of(result.model)` has camera and board with their deviations.
 """
 
 from __future__ import annotations

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import golden_bank
+import inclinometer
+import laser_line
 import reading_bank
 import torch
 import two_arms_bank
@@ -94,6 +96,23 @@ def _several() -> Source:
     return _of_arm(golden, 0.15, arm, (1, 0))
 
 
+def _beams() -> Source:
+    """A kind of device from outside the package: distances of the ball from lines, beside positions of a marker."""
+    arm = SimulatedArm(0, markers=2)
+    q, points = arm.measure(40, seed=5)
+    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
+    rows: Any = dc.Observations.joined([tracked, laser_line.readings(arm, arm.sample(160, seed=6))])
+    return _of_arm(Golden(arm.nominal, rows, reading_bank.scales(), q[:5]), 0.25, arm, (1, 0))
+
+
+def _inclinations() -> Source:
+    """One that sees a frame: two angles of the tool against gravity, beside its poses."""
+    known = golden_bank.poses(40)
+    arm = simulated_poses(1)[0]
+    rows: Any = dc.Observations.joined([known.rows, inclinometer.readings(arm, arm.sample(90, seed=6))])  # pyright: ignore
+    return _of_arm(replace(known, rows=rows), 0.25, arm, (0, 1, 2))
+
+
 SOURCES: dict[str, Callable[[], Source]] = {
     "positions": lambda: _of_arm(golden_bank.positions(56), 0.2, SimulatedArm(seed=1)),
     "poses": _poses,
@@ -109,6 +128,8 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
     "images of a board": _images,
     "several kinds": _several,
+    "laser beams": _beams,
+    "inclinations": _inclinations,
 }
 KINDS = tuple(SOURCES)
 POSITIONED = ("positions", "hidden markers")
@@ -204,7 +225,7 @@ class Kind:
 
     def written(self, rows: Any, path: Path) -> tuple[TableColumns, TableFormat]:
         named = rows.with_joint_names(self.robot.joint_names)
-        turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in WITH_POSES else {}
+        turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in (*WITH_POSES, "inclinations") else {}
         table = TableFormat("mm", "deg", camera_on_tool=self.name in CAMERAS, **turned)  # pyright: ignore
         return write_measurements(path, named, table)
 

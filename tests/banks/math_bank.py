@@ -20,7 +20,7 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.paper.algorithms import SECTION_5_SIGMA, section_5, section_5_kernels
+from diffeo_calib.paper.figures import SECTION_5_SIGMA, section_5, section_5_kernels
 from diffeo_calib.robots import elastic_rr
 
 Kappa = Callable[[Tensor], Tensor]

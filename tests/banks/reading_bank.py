@@ -34,12 +34,14 @@ def pixels(z: Tensor, which: Tensor) -> Tensor:
     return torch.stack(columns, 1)
 
 
-def readings(arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0) -> dc.Readings:
-    q, which = arm.sample(rows, 1), torch.arange(rows) % 3
-    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=3)
+def readings(
+    arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0, *, seed: int = 1
+) -> dc.Readings:
+    q, which = arm.sample(rows, seed), torch.arange(rows) % 3
+    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=seed + 2)
     z, joints = in_base(arm, q), arm.nominal.joint_names
     if kind == "image":
-        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=3)
+        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=seed + 2)
         return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)
     if kind == "distance":
         lengths = (z - POINTS[which]).norm(dim=1) + zero + draws

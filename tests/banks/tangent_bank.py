@@ -17,8 +17,8 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -193,6 +193,10 @@ def noise_covariance(scales: dc.Hyperparameters, setting: Setting, theta: Tensor
     else:
         assert data.lever is not None
         slack = 0.1 * setting.identification.noise
+        if data.covariance is not None:  # no larger than the smallest known deviation of poses, of 6 freedoms in 9
+            smallest = torch.linalg.eigvalsh(data.covariance)[:, 3]
+            smallest = smallest[smallest > 1e-14]
+            slack = min(slack, float(smallest.median().sqrt())) if len(smallest) else slack
         R += (slack**2 + 1e-14) * torch.eye(m, dtype=torch.float64)
         modes = body_modes(data.poses, data.lever)
         for k in range(6):

@@ -13,7 +13,7 @@ from paper_rr import Case, at_the_border, attempt, cases, measure
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 FIELDS = {

@@ -19,9 +19,9 @@ from diffeo_calib.calibration.scales.cross_validation import (
     cross_validated_inflation,
     left_out_squares,
     motions,
+    noise_of_new_rows,
     random_folds,
 )
-from diffeo_calib.calibration.scales.differing_noise import noise_of_new_rows
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, region_factor

@@ -23,16 +23,15 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
 from diffeo_calib.calibration.diagnostics.moved_devices import find_change_point
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
 from diffeo_calib.calibration.identification.identification import Prior, identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.identification.robust_registration import (
+from diffeo_calib.calibration.identification.registration import (
     find_joint_offsets,
+    register,
     register_robustly,
     with_joint_offsets,
 )
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterior, select
+from diffeo_calib.calibration.scales.selection import SearchLimits, defaults, log_posterior, select
 from diffeo_calib.calibration.student_t import Tails, reweight
 
 pytestmark = pytest.mark.slow  # several calibrations

@@ -9,7 +9,7 @@ from tangent_bank import Setting, built, gravity_covariance, normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.calibration.scales.defaults import LARGEST_AMPLITUDE_RATIO, SMALLEST_LOAD_RATIO, defaults
+from diffeo_calib.calibration.scales.selection import LARGEST_AMPLITUDE_RATIO, SMALLEST_LOAD_RATIO, defaults
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint
 

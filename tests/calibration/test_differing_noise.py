@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from scipy.stats import chi2
@@ -9,8 +11,9 @@ from simulated_camera import camera_arm
 from tangent_bank import Setting, normal, two_markers
 from torch import Tensor
 
-from diffeo_calib.calibration.robot_problem import robot_problem
-from diffeo_calib.calibration.scales.differing_noise import differing_factor
+from diffeo_calib.calibration.choose_scales import robot_problem
+from diffeo_calib.calibration.scales.differing_noise import differing_factor, noise_of_new_rows
+from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.poses import LEVER
@@ -95,3 +98,18 @@ def test_new_noise_is_the_mean_and_what_differs() -> None:
     factor = differing_factor(each, mean, data.visible)
     assert factor > 1.001
     torch.testing.assert_close(robot_problem(data, scales).new_noise, factor * mean, rtol=1e-12, atol=0.0)
+
+
+def test_rows_with_known_deviations_keep_their_own() -> None:
+    """They are judged by these: the mean is too large for most, and too small for the rest."""
+    data = two_markers().tangent_data
+    known = data.noise_model.known
+    each = blocks(*data.y.shape, seed=8) * 1e-8
+    data = replace(data, noise_model=replace(data.noise_model, known=each))
+    scales = two_markers().scales
+    wanted = data.noise(scales) * region_factor(data.tails.freedom, 3)
+    torch.testing.assert_close(noise_of_new_rows(data, scales), wanted, rtol=1e-12, atol=0.0)
+    assert known is None
+    plain = two_markers().tangent_data
+    found = noise_of_new_rows(plain, scales)
+    torch.testing.assert_close(found, found[:1].expand_as(found))

@@ -8,10 +8,14 @@ from typing import Any
 import golden_bank
 import pytest
 import torch
+from campaigns import CAMPAIGNS
+from degenerate import arm_of, measured
+from kind_bank import KINDS, kind_named
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
+from diffeo_calib.calibration.expected_errors import ExpectedError, OpenPlaces, expected_errors, workspace_deviation
+from diffeo_calib.reports.analysis.stages import stages_of
 from diffeo_calib.robots.se3 import twist_transform
 
 FAR = twist_transform(torch.tensor([0.03, -0.02, 0.01, 0.02, 0.01, -0.03], dtype=torch.float64))
@@ -59,3 +63,45 @@ def test_residual_and_shifts_of_a_fit_leave_its_noise() -> None:
     own = torch.linalg.solve(noise.covariance, (fit.residual - noise.shared @ fit.shifts)[..., None])[..., 0]
     torch.testing.assert_close(noise.solve(fit.residual), own, rtol=1e-6, atol=1e-6 * float(own.abs().max()))
     assert float(fit.shifts.norm()) > 0
+
+
+@pytest.mark.parametrize("name", ["tool never turned", "tool turned about the vertical"])
+def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -> None:
+    """The truth differs from the model as expected, after the marker has been put where it fits best."""
+    arm, generator = arm_of("1 marker", 0), torch.Generator().manual_seed(0)
+    data = measured(arm, "1 marker", CAMPAIGNS[name](arm, 60, generator), generator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that is the case
+        model = dc.calibrate(arm.nominal, data).model
+    found, q = ExpectedError.of(model), model.map.everywhere
+    assert found.whole > 5 * found.workspace
+    assert any("marker" in place for place in found.open_places)
+    errors = (model(q).detach() - arm.true_points(q)).flatten(1)
+    apart = float(OpenPlaces.of(model.map).left_of(errors).square().sum(1).mean().sqrt())
+    assert 0.3 * apart < found.workspace < 6 * apart
+    by_stage = expected_errors(model, stages_of(model))
+    assert by_stage["calibrated"] == pytest.approx(found.workspace)
+    assert by_stage["calibrated"] < by_stage["geometric"] < by_stage["nominal"] < 5e-3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        moved = model.registered(data[:12])  # these rows leave it open again
+    again = ExpectedError.of(moved)
+    assert again.whole > 5 * again.workspace
+    assert again.open_places
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_usual_rows_leave_no_place_open(name: str) -> None:
+    found = ExpectedError.of(kind_named(name).model)
+    assert found.open_places == ()
+    assert found.workspace == found.whole
+
+
+@pytest.mark.parametrize("name", ["positions", "hidden markers", "poses", "ball in sockets"])
+def test_expectation_plan_and_stages_give_one_number(name: str) -> None:
+    model = kind_named(name).model
+    found, q = ExpectedError.of(model), model.map.everywhere
+    tracker = dc.Sensor.positions() if name == "ball in sockets" else None  # no random pose is in a socket
+    planned = dc.plan(model, q, 1, target=q, sensor=tracker).known_rms.square().mean().sqrt()
+    assert float(planned) == pytest.approx(found.whole, rel=1e-3)
+    assert expected_errors(model, {"itself": model})["itself"] == pytest.approx(found.workspace)

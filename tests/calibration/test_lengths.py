@@ -102,3 +102,11 @@ def test_a_robot_without_errors_is_said_to_have_none() -> None:
     perfect = SimulatedArm(2, geometry=0, transmission=0, gravity=0)
     with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot"):
         dc.calibrate(perfect.nominal, dc.Measurements(*perfect.measure(ROWS)), hyperparameters=scales())
+
+
+@pytest.mark.parametrize("lever", [10.0, 1e-3, 1e-4])
+def test_levers_in_another_unit_are_refused(lever: float) -> None:
+    q = ARM.sample(ROWS, 1)
+    data = dc.Measurements.from_poses(q, ARM.truth.poses(q), lever=lever)
+    with pytest.raises(MeasurementError, match=rf"lever.* got {1e3 * lever:g} mm"):
+        dc.calibrate(ARM.nominal, data)

@@ -16,7 +16,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import leave_one_out
-from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import seeded
 from diffeo_calib.fitting import fit as fitting

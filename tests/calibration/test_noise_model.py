@@ -242,3 +242,18 @@ def test_squares_of_noise_itself_count_its_coordinates(sensor: NoiseModel, m: in
     for body in range(sensor.bodies):
         share = float((squares[:, body] > float(chi2.isf(0.1, sensor.freedom))).double().mean())
         assert share == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.parametrize("residual", [1e-3, 1e-6])
+def test_the_slack_drowns_no_known_error(residual: float) -> None:
+    """Poses are as exact as their best direction says, however large the others, and the residuals, are."""
+    frames, best = poses(20), 3e-6
+    known = {"position_std": torch.tensor([best, 3e-4, 1e-3]).expand(20, 3), "rotation_std": 2e-3}
+    q = normal(20, 2, seed=4)
+    data = dc.Measurements.from_poses(q, frames, lever=LEVER, **known)  # pyright: ignore[reportArgumentType]
+    found = NoiseModel.of(data, residual)
+    assert found.slack == pytest.approx(min(SLACK_SHARE * residual, 3**0.5 * best), rel=1e-3)
+    free = NoiseModel.of(dc.Measurements.from_poses(q, frames, lever=LEVER), residual)
+    assert free.slack == pytest.approx(SLACK_SHARE * residual)
+    points = dc.Measurements(q, frames[:, None, :3, 3], std=best)
+    assert NoiseModel.of(points, residual).slack == pytest.approx(SLACK_SHARE * residual)

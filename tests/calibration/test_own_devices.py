@@ -1,15 +1,20 @@
-"""A kind of device from outside the package, that of scripts/examples/laser_line.py: fitted, judged, written, read."""
+"""Kinds of devices from outside the package, those of scripts/examples: what the matrix of verbs does not look at."""
 
 from __future__ import annotations
 
-import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import inclinometer
+import laser_line
 import pytest
 import reading_bank
 import torch
-from kind_bank import rigid_rms
+from inclinometer import Inclinometers
+from kind_bank import kind_named, rigid_rms
+from laser_line import Beams, readings
+from product_bank import simulated_poses
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -21,17 +26,13 @@ from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import KINDS, kind_of, register
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts" / "examples"))
-import laser_line
-from laser_line import Beams, readings
-
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 
 @pytest.fixture(autouse=True)
 def registered() -> None:
-    """The class of this module, also where another test ran the example as a program in this process."""
-    KINDS[Beams.kind] = Beams
+    """The classes of these modules, also where another test ran an example as a program in this process."""
+    KINDS.update({Beams.kind: Beams, Inclinometers.kind: Inclinometers})
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +87,48 @@ def test_alone_it_calibrates_the_robot(arm: SimulatedArm) -> None:
     assert float(found.reading_errors(data)[1].abs().median()) < 5e-5
 
 
-def test_new_readings_are_judged_and_predicted(arm: SimulatedArm, result: Any, tmp_path: Path) -> None:
-    new = readings(arm, arm.sample(30, seed=7))
-    found: Any = dc.evaluate(result.model, new)
-    assert 1e-5 < found.rms < 3e-4
-    dc.save(result.model, tmp_path / "m.safetensors")
-    model: Any = dc.load(tmp_path / "m.safetensors")
-    assert_close(dc.evaluate(model, new).rms, found.rms)  # pyright: ignore
-    assert model.predict(new.q)[0].shape == (30, 2, 3)
+def test_an_inclinometer_finds_how_it_is_mounted_and_makes_the_model_better() -> None:
+    """Against the truth of the simulation, and a model of the poses alone."""
+    kind = kind_named("inclinations")
+    (own,) = kind.result.readings
+    axes, up = own.devices.constants[0, :6].view(2, 3), own.devices.constants[0, 6:]
+    frames = inclinometer.frames(simulated_poses(1)[0], kind.q(1))
+    model, _ = kind.model.predict_poses(kind.q(1))
+    mount = model[0, :3, :3].mT @ frames[0, :3, :3]  # the model's frame is that of the poses of the table
+    assert_close(axes @ mount, inclinometer.AXES, rtol=0, atol=2e-3)
+    assert_close(up, torch.nn.functional.normalize(inclinometer.UP, dim=0), rtol=0, atol=2e-3)
+    assert float(own.known.max()) < 2e-3  # pyright: ignore
+    alone = dc.calibrate(kind.robot, kind.data.parts[0], hyperparameters=kind.scales).model
+    q = kind.q(100)
+    assert kind.error_mm(kind.model(q), q) < kind.error_mm(alone(q), q)
+
+
+def test_numbers_of_a_frame_have_their_own_noise_and_freedom() -> None:
+    """Rows of the inclinometer: none of the shift, turn and slack of poses, two numbers."""
+    data = kind_named("inclinations").result.placed.tangent_data()
+    rows, noise = data.visible.sum(1) == 2, data.noise_model
+    scales = replace(kind_named("inclinations").scales, other_noise=torch.tensor([3e-5], dtype=torch.float64))
+    jacobian = data.jacobian[rows][:, :2]
+    of_joints = jacobian * scales.joint_noise.square() @ jacobian.mT
+    expected = of_joints + (3e-5**2 + noise.smallest_noise**2) * torch.eye(2, dtype=torch.float64)
+    found = noise.covariance(scales, data.jacobian)
+    assert_close(found[rows][:, :2, :2], expected)
+    assert noise.freedom[rows].unique().tolist() == [2]  # pyright: ignore
+    assert noise.freedom[~rows].unique().tolist() == [6]  # pyright: ignore
+    errors = torch.diag_embed(1e-10 * data.visible.to(data.y))
+    alone = torch.linalg.inv(expected).diagonal(dim1=1, dim2=2).sum(1) * 1e-10
+    assert_close(noise.squares(found, errors)[rows, 0], alone)
+
+
+def test_a_frame_is_seen_beside_poses_only() -> None:
+    arm = simulated_poses(1)[0]
+    seen, (q, points) = inclinometer.readings(arm, arm.sample(60)), arm.measure(20)
+    marked = dc.Measurements(q, points[:, :1], arm.nominal.joint_names)
+    for rows in (seen, dc.Observations.joined([marked, seen])):
+        with pytest.raises(MeasurementError, match=r"inclination.*beside measured poses"):
+            dc.calibrate(arm.nominal, rows)  # pyright: ignore
+    with pytest.raises(InputError, match="poses"):
+        dc.evaluate(kind_named("positions").model, seen)
 
 
 def test_poses_are_planned_for_it(arm: SimulatedArm, result: Any) -> None:

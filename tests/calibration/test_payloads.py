@@ -114,7 +114,7 @@ def test_registration_finds_the_device_under_one_payload(
     some = other.q[:12]
     moved = dc.Measurements(some, arm.true_points(some, 9.0) + shift).with_payload(9.0)
     found = result.model.registered(moved)
-    assert found.payload == 9.0
+    assert found.payload == result.model.payload
     truth = dc.Measurements(other.q, other.points + shift).with_payload(other.payload)
     assert dc.evaluate(found, truth).rms < 2.0 * dc.evaluate(result.model, other).rms
 

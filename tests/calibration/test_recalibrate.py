@@ -108,6 +108,23 @@ def test_old_rows_and_new_rows_together_are_one_calibration(arm: Case) -> None:
     assert dc.evaluate(twice, test).rms < 1.08 * dc.evaluate(once, test).rms
 
 
+@pytest.mark.parametrize(("joint", "size"), [(1, -3e-4), (2, 6e-4), (4, 1.5e-3)])
+def test_a_moved_zero_is_named_with_its_size(arm: Case, joint: int, size: float) -> None:
+    robot = simulated(1)[0]
+    q, moved = robot.sample(NEW_ROWS, 5), torch.zeros(6, dtype=torch.float64)
+    moved[joint] = size
+    y = robot.true_points(q + moved)
+    noise = robot.noise * torch.randn(y.shape, generator=torch.Generator().manual_seed(1), dtype=y.dtype)
+    found = dc.compare(arm.model, seen_from(elsewhere(), dc.Measurements(q, y + noise)))
+    change, *rest = found.changes.found
+    assert not rest
+    assert change.part == f"the offset of {robot.nominal.joint_names[joint]}"
+    assert change.deviation is not None
+    assert change.deviation < 0.1e-3
+    assert abs(change.size - size) < 4 * change.deviation
+    assert change.others == ()
+
+
 def test_a_worn_joint_is_named_and_followed(arm: Case) -> None:
     robot = worn(1, 2.0)
     new, test = measured(robot, NEW_ROWS, 5), measured(robot, 100, 6)

@@ -106,6 +106,22 @@ def test_a_recalibrated_model_keeps_its_tool() -> None:
     assert found.tool_tip == ARM.nominal.tip
 
 
+def test_a_session_that_deviates_is_a_change_and_no_outliers() -> None:
+    """A joint wears between two of three sessions."""
+    model, worn = again_bank.model(again_bank.positions), ARM.worn(again_bank.WORN, 5.0)
+    tables = [again_bank.positions(ARM, 20, 5), again_bank.positions(ARM, 20, 6), again_bank.positions(worn, 12, 7)]
+    joint, names = ARM.nominal.joint_names[again_bank.WORN], ["a"] * 20 + ["b"] * 20 + ["c"] * 12
+    rows: Any = dc.Measurements.joined(tables)
+    found: Any = dc.compare(model, rows.with_sessions(names))
+    assert [(one.part, one.where) for one in found.changes.found] == [(joint, "session 'c'")]
+    (block,) = quietly(dc.compare, model, rows).changes.found
+    assert block.where in {f"rows {first} to 51" for first in (40, 41, 42)}
+    with pytest.warns(dc.DiffeoCalibWarning, match="session 'c' deviates"):
+        dc.recalibrate(model, rows.with_sessions(names))
+    clean = dc.Measurements.joined(tables[:2]).with_sessions(names[:40])
+    assert dc.compare(model, clean).changes.found == ()  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def test_every_session_has_its_own_frame() -> None:
     model, rows = again_bank.model(again_bank.positions), again_bank.sessions(ARM, 30, 5)
     found = dc.recalibrate(model, rows)

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import Geometry, SimulatedArm, from_dh
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import twist_transform
 
 ARM = SimulatedArm()

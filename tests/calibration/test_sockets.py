@@ -129,9 +129,8 @@ def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult)
 def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: SimulatedArm) -> None:
     """Closed form against a regression without the rows of the place."""
     from diffeo_calib.calibration.choose_scales import ChosenScales
-    from diffeo_calib.calibration.scales.defaults import defaults
     from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
-    from diffeo_calib.calibration.scales.selection import Selection
+    from diffeo_calib.calibration.scales.selection import Selection, defaults
 
     placed = place(arm.nominal, data, silent)
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
@@ -154,7 +153,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
-    from diffeo_calib.calibration.scales.defaults import defaults
+    from diffeo_calib.calibration.scales.selection import defaults
     from diffeo_calib.calibration.student_t import region_factor
 
     placed = place(arm.nominal, data, silent)

@@ -12,10 +12,9 @@ from board_bank import CAMERA, images
 from torch.autograd.functional import jacobian
 from torch.testing import assert_close
 
-from diffeo_calib.cameras.board import BoardPrior, board_slopes, real_board
+from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.cameras.files import read_camera, write_camera
 from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted
-from diffeo_calib.cameras.lens import LENS, project, project_slopes
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
 

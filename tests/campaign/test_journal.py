@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import random
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from command_bank import PROGRAM, Command
@@ -141,3 +143,31 @@ def test_a_killed_campaign_loses_no_row(tmp_path: Path, lines: list[str]) -> Non
     journal = [json.loads(line) for line in (tmp_path / "run.csv.journal").read_text().splitlines()]
     assert [one["line"] for one in journal if "line" in one] == list(range(2, ROWS + 2))
     assert (tmp_path / "run.csv").read_text().count("\n") == ROWS + 1
+
+
+@pytest.mark.slow
+def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, lines: list[str]) -> None:
+    (tmp_path / "run.csv").write_text("".join(lines[:17]))
+    words = ["campaign", "campaign.toml", "--stdin", "--page", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", PROGRAM, *words],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    address = urlsplit(process.stdout.readline().split()[-1])
+    assert any("row 15" in line for line in process.stdout)
+    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
+    connection.request("POST", "/reject?row=5", headers={"X-Campaign": "1"})
+    assert connection.getresponse().status == 200
+    connection.close()
+    journal = tmp_path / "run.csv.journal"
+    for _ in range(600):
+        if '"row": 5' in journal.read_text():
+            break
+        time.sleep(0.1)
+    out = process.communicate(timeout=120)[0]
+    assert "15 of 16 rows accepted" in out
+    assert json.loads(journal.read_text().splitlines()[-1])["decided"] is True

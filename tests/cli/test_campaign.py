@@ -16,7 +16,7 @@ from typer.main import get_command
 import diffeo_calib as dc
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
-from diffeo_calib.cli.proposals import (
+from diffeo_calib.cli.guesses import (
     guess_deviations,
     guess_joints,
     guess_positions,
@@ -366,3 +366,30 @@ def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Comma
 def test_positions_by_usual_names(before: str) -> None:
     names = [f"{before}{axis}" for axis in "xyz"]
     assert guess_positions([*names, "rx", "ry", "rz", "q1"]) == [names]
+
+
+def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command) -> None:
+    """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
+    kind = kind_named("images")
+    table, _ = kind.table()
+    assert command("init", table, kind.urdf, "-o", tmp_path / "c.toml").code == 0
+    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert (written["reading"], written["session"], written["angle"]) == ("image=u,v,FX,FY,CX,CY", "session", "deg")
+    refused = command("fit", tmp_path / "c.toml")
+    assert refused.code == 1
+    assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
+
+
+def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, command: Command) -> None:
+    """Rows of several kinds leave the cells of the other kinds empty."""
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    frame = dc.Measurements(*arm.measure(40, seed=0), arm.nominal.joint_names).to_frame()
+    frame["distance"] = 1.0
+    frame["session"] = ["monday", "tuesday"] * 20
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml").code == 0
+    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert "reading" not in written
+    assert written["session"] == "session"
+    assert "not used: distance" in (tmp_path / "c.toml").read_text()

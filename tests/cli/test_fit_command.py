@@ -22,6 +22,8 @@ from diffeo_calib.calibration.findings import Outlier, parts
 from diffeo_calib.cli.printed import outlier_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import twist_transform
 
 
 def test_fit_prints_three_stages_in_training_and_held_out(
@@ -53,6 +55,26 @@ def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.Calibrate
     assert "look wrong" not in fitted.out
     assert model.report["outliers"] == 0
     assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
+
+
+def test_fit_with_the_scales_of_another_robot(
+    model: dc.CalibratedKinematics, site: Site, command: Command, tmp_path: Path
+) -> None:
+    known, own = site.folder / "model.safetensors", tmp_path / "own.safetensors"
+    assert command(*site.fit(site.csv, own, "--scales-of", known)).code == 0
+    found = dc.load(own)
+    assert isinstance(found, dc.CalibratedKinematics)
+    assert found.scales is not None
+    assert model.scales is not None
+    ratios = (found.scales / model.scales)[model.scales > 0]
+    assert torch.unique(ratios.round(decimals=6)).numel() == 2  # length scales and factors; deviations
+    assert float(ratios.min()) == pytest.approx(1.0) or float(ratios.max()) == pytest.approx(1.0)
+
+
+def test_scales_of_what_is_no_model_are_refused(site: Site, command: Command, tmp_path: Path) -> None:
+    done = command(*site.fit(site.csv, tmp_path / "own.safetensors", "--scales-of", site.csv))
+    assert done.code == 1
+    assert "measured.csv" in done.err
 
 
 @pytest.mark.slow
@@ -185,3 +207,20 @@ def test_standard_deviations_of_points(
     assert command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", tmp_path / "m").code == 130
     torch.testing.assert_close(seen[0].std, data.std, rtol=1e-12, atol=0)
     assert seen[0].poses is None
+
+
+def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=0)
+    q, points = arm.measure(90, seed=3)
+    turn = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.03, 0.05, 0.1], dtype=torch.float64))
+    points[55:] = points[55:] @ turn[:3, :3].mT + turn[:3, 3]
+    table = tmp_path / "moved.csv"
+    write_measurements(table, dc.Measurements(q, points, arm.nominal.joint_names), TableFormat("mm", "deg"))
+    arm.write_urdf(tmp_path / "arm.urdf")
+    robot = ["--robot", tmp_path / "arm.urdf", "--base", arm.nominal.base, "--tip", arm.nominal.tip]
+    given = [*robot, "--position", "x,y,z", "--length", "mm", "--angle", "deg", "-o", tmp_path / "m.safetensors"]
+    done = command("fit", table, *given)
+    assert done.code == 1
+    assert any("near row 57" in line for line in done.warnings)
+    assert "from the model" in done.error
+    assert "session" in done.error

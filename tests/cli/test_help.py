@@ -22,13 +22,14 @@ OPTIONS = {
             "--duplicates",
             "--figure",
             "--note",
+            "--scales-of",
             "--report",
             "--jobs",
         ),
     ],
     "campaign": [
         *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session"),
-        *("--payload", "--target", "--stdin", "--once", "--candidates", "--next", "--accepted"),
+        *("--payload", "--target", "--stdin", "--once", "--candidates", "--page", "--next", "--accepted"),
     ],
     "evaluate": [
         *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),

@@ -20,7 +20,7 @@ from command_bank import (
 )
 
 import diffeo_calib as dc
-from diffeo_calib.cli.interrupts import Interrupts
+from diffeo_calib.cli.console import Interrupts
 
 
 def interrupted_calibrate(*_: Any, **__: Any) -> None:
@@ -63,7 +63,7 @@ def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_pa
 def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, and the second time, the process ends."""
     ended: list[str] = []
-    monkeypatch.setattr("diffeo_calib.cli.interrupts.end_process", ended.append)
+    monkeypatch.setattr("diffeo_calib.cli.console.end_process", ended.append)
     before = signal.getsignal(signal.SIGINT)
     interrupts, seen, notes = Interrupts(), [], []
     interrupts.install()

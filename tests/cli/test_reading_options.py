@@ -65,7 +65,12 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
     assert strict.code == 4
     assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
-    assert Path("p.csv").read_text().splitlines()[0].endswith("x,y,z,std_x,std_y,std_z")
+    assert (
+        Path("p.csv")
+        .read_text()
+        .splitlines()[0]
+        .endswith("x,y,z,std_x,std_y,std_z,distance_A,std_distance_A,distance_B,std_distance_B")
+    )
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_register_prints_and_writes_the_registered_model(
     path, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
     done = command("evaluate", site.folder / "model.safetensors", path, *TABLE, "--register", "-o", output)
     assert (done.code, done.err.strip()) == (0, "")
-    before, after = done.numbers("8 before registration")[0], done.numbers("8 after registration")[0]
+    before, after = done.numbers("8 with the places of the fit")[0], done.numbers("8 with places found anew")[0]
     assert before > 10.0
     assert after < 0.5
     assert "8 rows took part: RMS " in done.out

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

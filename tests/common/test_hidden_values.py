@@ -5,7 +5,7 @@ from math import inf, nan
 import torch
 from torch.testing import assert_close
 
-from diffeo_calib.common.hidden_values import known, largest_known
+from diffeo_calib.common.quantiles import known, largest_known
 
 
 def test_largest_known_value() -> None:

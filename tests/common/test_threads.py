@@ -22,7 +22,7 @@ from diffeo_calib.common.threads import (
     small_work,
     torch_alone,
 )
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 
 
 def counts() -> list[int]:

@@ -11,10 +11,10 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.objective import tangent
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 

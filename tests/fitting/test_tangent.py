@@ -10,8 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.objective import Regression, regress, tangent
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.tangent import Regression, regress, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.cholesky import CholeskyRegression

@@ -13,7 +13,7 @@ from product_bank import Case, ur10_measurements
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.robust_registration import with_joint_offsets
+from diffeo_calib.calibration.identification.registration import with_joint_offsets
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import (
     GEOMETRIC,

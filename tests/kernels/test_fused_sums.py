@@ -20,7 +20,7 @@ from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profil
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
-from diffeo_calib.kernels.reductions.fused import native, sums
+from diffeo_calib.kernels.reductions.fused import sums
 from diffeo_calib.kernels.reductions.fused.loops import Program
 from diffeo_calib.kernels.reductions.fused.sums import Fused
 from diffeo_calib.kernels.reductions.fused.symbols import Vector
@@ -50,7 +50,7 @@ def test_sums_of_several_tiles_are_those_of_one_matrix(formula: Formula, profile
 @pytest.mark.parametrize("lanes", [2, 4, 8, 16])
 def test_vectors_of_every_width(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processors without wide registers, and wider ones: LLVM splits or joins vectors where it must."""
-    monkeypatch.setattr(native.machine(), "vector_bytes", 8 * lanes)
+    monkeypatch.setattr(sums.machine(), "vector_bytes", 8 * lanes)
     monkeypatch.setattr(sums, "MOST_GROUP", max(16, lanes))
     j = points(61, 2)
     assert_same(fused(FULL, GaussianProfile(), None, j), Dense().reduce(FULL, GaussianProfile(), None, j), 1e-11)
@@ -187,11 +187,11 @@ def test_what_cannot_be_compiled_is_left_to_others() -> None:
 def test_compiled_code_is_kept_and_damaged_files_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     j, compiled = points(30, 2), []
-    emit = native.Machine._emit
-    monkeypatch.setattr(native.Machine, "_emit", lambda self, text: compiled.append(1) or emit(self, text))
+    emit = sums.Machine._emit
+    monkeypatch.setattr(sums.Machine, "_emit", lambda self, text: compiled.append(1) or emit(self, text))
     found = []
     for damage in (False, False, True):
-        monkeypatch.setattr(sums, "machine", cache(native.Machine))
+        monkeypatch.setattr(sums, "machine", cache(sums.Machine))
         for file in (tmp_path / "diffeo_calib" / "fused").glob("*") if damage else ():
             file.write_bytes(file.read_bytes()[:-9])
         found.append(fused(FIELD, GaussianProfile(), None, j))
@@ -202,14 +202,14 @@ def test_compiled_code_is_kept_and_damaged_files_are_replaced(tmp_path: Path, mo
 def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    monkeypatch.setattr(sums, "machine", cache(native.Machine))
+    monkeypatch.setattr(sums, "machine", cache(sums.Machine))
     j = points(30, 2)
     assert_same(fused(FIELD, GaussianProfile(), None, j), Dense().reduce(FIELD, GaussianProfile(), None, j), 1e-12)
 
 
 def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "llvmlite", None)
-    monkeypatch.setattr(sums, "machine", native.Machine)
+    monkeypatch.setattr(sums, "machine", sums.Machine)
     sums._reason.cache_clear()
     sums._warn.cache_clear()
     q, a = normal(200, 3, seed=1), normal(200, 3, seed=2)

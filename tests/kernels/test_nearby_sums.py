@@ -11,7 +11,7 @@ import diffeo_calib as dc
 from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, nearby
 from diffeo_calib.kernels.reductions.formulas import FIELD, Formula, Points
-from diffeo_calib.kernels.reductions.reach import negligible_beyond
+from diffeo_calib.kernels.reductions.nearby import negligible_beyond
 
 COUNT, SIDE = 3000, 60.0
 decaying = pytest.mark.parametrize("profile", [GaussianProfile(), MaternProfile(1.5), MaternProfile(2.5)])

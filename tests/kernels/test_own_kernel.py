@@ -12,7 +12,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.paper.algorithms import section_5, section_5_kernels
+from diffeo_calib.paper.figures import section_5, section_5_kernels
 
 
 class Skewed(Kernel):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.path import Pace
+from diffeo_calib.kinematics.compensation.compensate import Pace
 
 
 def line(case: Case, rows: int, seed: int = 3) -> Tensor:

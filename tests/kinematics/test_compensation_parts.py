@@ -13,8 +13,7 @@ from product_bank import Case
 from robots_bank import CHAINS, every_chain, parallelogram
 
 import diffeo_calib as dc
-from diffeo_calib.kinematics.compensation.bounds import joint_limits
-from diffeo_calib.kinematics.compensation.box_search import box_minimum
+from diffeo_calib.kinematics.compensation.box_search import box_minimum, joint_limits
 from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import twist_transform

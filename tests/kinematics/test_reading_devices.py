@@ -61,14 +61,14 @@ def test_known_points_place_their_devices(kind: str) -> None:
     """In closed form of exact readings; with a few wrong rows nearly as well."""
     data = readings(kind)
     assert float(KINDS[kind].at(data, points(Q)[:, 0]).errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
-    found = placed(data, points(data.q)[:, 0])
+    found = placed(data, points(data.q))
     assert float(found.errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
     known = constants(kind)
     size = known.shape[1] - (kind == "image")
     assert_close(found.constants[:, :size], known[:, :size], rtol=0, atol=1e-7)
     wrong = data.values.clone()
     wrong[5:8] += 0.2
-    robust = placed(replace(data, values=wrong), points(Q)[:, 0])
+    robust = placed(replace(data, values=wrong), points(Q))
     assert_close(robust.constants[:, :size], known[:, :size], rtol=0, atol=1e-3)
 
 
@@ -88,7 +88,7 @@ def test_a_unit_vector_of_least_squares(size: float) -> None:
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
 def test_shared_effects_are_derivatives_by_increments(kind: str) -> None:
     data = readings(kind)
-    devices, at = placed(data, points(data.q)[:, 0]), points(Q)[:, 0]
+    devices, at = placed(data, points(data.q)), points(Q)[:, 0]
     step = normal(2, len(devices.deviations), seed=7)
     eps = 1e-6
 
@@ -102,7 +102,7 @@ def test_shared_effects_are_derivatives_by_increments(kind: str) -> None:
 
 def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:
     data = readings("image")
-    devices = placed(data, points(data.q)[:, 0])
+    devices = placed(data, points(data.q))
     assert isinstance(devices, Cameras)
     depth = torch.einsum("nj,nij->ni", points(Q)[:, 0], devices.poses[data.device][:, :3, :3])[:, 2]
     depth = depth + devices.poses[data.device][:, 2, 3]
@@ -117,7 +117,7 @@ def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:
 
 def test_what_is_refused() -> None:
     data = readings("distance")
-    devices = placed(data, points(data.q)[:, 0])
+    devices = placed(data, points(data.q))
     with pytest.raises(MeasurementError, match="expected distances of left, right, got heights of left, right"):
         devices.errors(readings("height"), points(Q)[:, 0])
     with pytest.raises(MeasurementError, match="at least 8 rows of each device, got 'right' 3"):
@@ -138,7 +138,7 @@ def test_a_model_of_a_marker_does_not_know_the_ball(arm: Case) -> None:
 def test_readings_that_are_noise_are_refused_by_a_sentence() -> None:
     seen = dc.Readings.images(Q, 3.0 * normal(ROWS, 2, seed=3), NAMES, focal=(1.0, 1.0), centre=(0.0, 0.0))
     with pytest.raises(MeasurementError, match="no place of the devices explains the readings"):
-        placed(seen, points(seen.q)[:, 0])
+        placed(seen, points(seen.q))
 
 
 def test_rows_keep_together_and_are_told_apart() -> None:

@@ -14,10 +14,9 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.interop.model_entries import describe_registration, rebuild_registration
+from diffeo_calib.interop.model_header import describe_registration, rebuild_registration
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.kinematics.new_frame import check_isotropic, moved
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, check_isotropic, moved
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.robots.se3 import twist_transform
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import Kind, kind_named
+from kind_bank import ELSEWHERE, Kind, kind_named
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -14,6 +14,7 @@ from diffeo_calib.calibration.judgement import accuracy
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots.se3 import twist_transform
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +75,37 @@ def test_a_model_is_not_more_accurate_than_readings_are_near(kind: Kind) -> None
         found = residuals(kind.model, place(kind.model, rows), rows)
         worst = accuracy(kind.model, found, nothing, "m")
         assert worst.value == pytest.approx(found.main.rms if expected is None else expected)
+
+
+@pytest.mark.parametrize("name", ["mixture", "several kinds"])
+def test_positions_beside_a_ball_are_registered_with_their_devices(name: str) -> None:
+    """The frame follows from the positions, the ball stays on the tool, and all devices are placed anew."""
+    kind = kind_named(name)
+    found = kind.model.registered(kind.moved)
+    registration = found.registration
+    assert registration is not None
+    assert registration.same
+    assert found.ball
+    assert_close(registration.markers[-1], kind.model.geometry.tool[-1], rtol=0, atol=1e-12)
+    assert float(registration.marker_deviations[-1].max()) == 0.0
+    T = twist_transform(ELSEWHERE)
+    for one, tolerance in ((registration.transform[:3, 3], 1e-3), (registration.transform[:3, :3], 2e-3)):
+        assert_close(one, T[:3, 3] if one.ndim == 1 else T[:3, :3], rtol=0, atol=tolerance)
+    _, covariance = found.predict(kind.q(5))
+    assert float(torch.linalg.eigvalsh(covariance).min()) > 1e-6**2  # the noise of a ball that no row shows, too
+    assert {name for own in found.placement for name in own.names} >= {
+        name for part in kind.moved.parts for name in part.device_names if name and part.kind != "mixture"
+    }
+
+
+def test_positions_alone_register_a_model_with_a_ball() -> None:
+    """The ball of the model is then still known."""
+    kind = kind_named("mixture")
+    found = kind.model.registered(kind.moved.device_rows())
+    assert found.ball
+    assert found.markers == kind.model.markers
+
+
+def test_a_registered_robot_carries_its_payload() -> None:
+    kind = kind_named("payloads")
+    assert kind.model.with_payload(3.0).registered(kind.moved).payload == 3.0

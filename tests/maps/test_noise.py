@@ -9,6 +9,7 @@ from math_bank import normal, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 
 
@@ -27,6 +28,16 @@ def test_the_operations_are_those_of_the_explicit_matrix() -> None:
     some = matrix.view(6, 3, 6, 3)[rows][:, :, rows].reshape(6, 6)
     torch.testing.assert_close(explicit(R.rows(rows)), some)
     torch.testing.assert_close(explicit(R.own), torch.block_diag(*R.covariance))
+
+
+def test_a_correlation_of_rounding_errors_is_symmetric() -> None:
+    """Products of Jacobians may leave 1e-19 and 1.00001e-19 beside variances of 1e-10."""
+    blocks = 1e-10 * torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+    blocks[1, 0, 1], blocks[1, 1, 0] = 1e-19, 1.00001e-19
+    assert torch.equal(Noise(blocks).covariance, blocks)
+    blocks[1, 1, 0] = 1e-12
+    with pytest.raises(InputError, match=r"`noise`.* at row 1"):
+        Noise(blocks)
 
 
 @pytest.mark.parametrize("reduced", [False, True])

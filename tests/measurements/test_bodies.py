@@ -7,8 +7,9 @@ import torch
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.bodies import bodies_of, origins, seen_board, table_of_points
+from diffeo_calib.measurements.bodies import bodies_of, seen_board
 from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import rotation, transforms
 
 N = 7
@@ -32,41 +33,54 @@ MIXTURE = dc.Measurements.joined([MARKERS, SOCKETS])
 
 
 def test_markers_and_frames_have_names_and_numbers() -> None:
-    markers, tips = bodies_of(MARKERS), bodies_of(TIPS)
-    assert (markers.count, tips.count) == (2, 2)
-    assert [markers.number(1), tips.number(1)] == [1, None]
-    assert [markers.tip(1), tips.tip(1)] == [None, "right"]
-    assert [markers.name(0), tips.name(0)] == ["marker 0", "the frame on 'left'"]
-    assert (list(markers.exchangeable), list(tips.exchangeable)) == ([0, 1], [])
-    single = bodies_of(dc.Measurements.from_poses(Q, POSES[:, 0], doubt=False))
-    assert (single.number(0), single.tip(0)) == (None, None)
+    assert MARKERS.bodies.labels(MARKERS) == [(0, None), (1, None)]
+    assert TIPS.bodies.labels(TIPS) == [(None, "left"), (None, "right")]
+    assert [list(data.bodies.exchangeable(data)) for data in (MARKERS, TIPS)] == [[0, 1], []]
+    single = dc.Measurements.from_poses(Q, POSES[:, 0], doubt=False)
+    assert single.bodies.labels(single) == [(None, None)]
+    named = TIPS.with_tips(None)
+    assert named.bodies.labels(named.bodies.on_tips(named, TIPS.on or ())) == TIPS.bodies.labels(TIPS)
 
 
 def test_only_markers_can_be_those_of_the_other_hand() -> None:
-    (mirrored,) = bodies_of(MARKERS).mirrored()
+    (mirrored,) = MARKERS.bodies.mirrored(MARKERS)
     assert_close(mirrored[..., :2], MARKERS.points[..., :2])
     assert_close(mirrored[..., 2], -MARKERS.points[..., 2])
-    assert not list(bodies_of(TIPS).mirrored())
+    assert not list(TIPS.bodies.mirrored(TIPS))
 
 
 def test_turns_are_angles_of_frames() -> None:
-    assert bodies_of(MARKERS).turns(MARKERS.points).shape == (N, 0)
+    assert MARKERS.bodies.turns(MARKERS, MARKERS.points).shape == (N, 0)
     turned = POSES.clone()
     turned[..., :3, :3] = turned[..., :3, :3] @ rotation(torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64))
     other = dc.Measurements.from_poses(Q, turned, on=("left", "right"), doubt=False)
-    angles = bodies_of(TIPS).turns(other.points)
+    angles = TIPS.bodies.turns(TIPS, other.points)
     assert_close(angles, torch.full_like(angles, 0.2))
-    errors = bodies_of(other).errors(POSES)
+    errors = other.bodies.errors(other, TIPS.points)
     assert_close(errors[..., :3], torch.zeros_like(errors[..., :3]))
     assert_close(errors[..., 3:].norm(dim=-1), angles)
 
 
 def test_the_ball_in_sockets_is_a_kind_of_its_own_beside_others_alone() -> None:
-    assert bodies_of(MARKERS).kinds is None
-    assert bodies_of(SOCKETS).kinds is None
-    kinds = bodies_of(MIXTURE).kinds
+    assert MARKERS.body_kinds is None
+    assert SOCKETS.body_kinds is None
+    kinds = MIXTURE.body_kinds
     assert kinds is not None
     assert kinds.tolist() == [[0, 0, 1]] * (2 * N)
+
+
+@pytest.mark.parametrize("table", [MARKERS, TIPS])
+def test_bodies_as_unknowns_move_as_their_slopes_say(table: dc.Measurements) -> None:
+    """Against central differences; a body at points that it reaches is there."""
+    body = table.bodies.at(table.points[0])
+    there = body.stepped(0.3 * random(len(body.from_old)))
+    unit = 1e-6 * torch.eye(len(body.from_old), dtype=torch.float64)
+    moved = [(there.stepped(h).points - there.stepped(-h).points).flatten() / 2e-6 for h in unit]
+    assert_close(there.slopes, torch.stack(moved, 1), rtol=0, atol=1e-8)
+    assert_close(body.at(there.points).points, there.points)
+    small = body.stepped(unit[0])
+    assert_close(small.from_old, unit[0], rtol=0, atol=1e-12)
+    assert len(body.deviations(1e-3)) == len(unit)
 
 
 def test_places_are_absent_as_numbers() -> None:
@@ -78,17 +92,17 @@ def test_places_are_absent_as_numbers() -> None:
 
 
 def test_points_become_poses_with_a_lever() -> None:
-    again = table_of_points(Q, TIPS.points, LEVER, ("left", "right"))
+    again = dc.Measurements.of_points(Q, TIPS.points, TIPS.on, LEVER)
     assert again.poses is not None
     assert_close(again.poses, POSES)
-    assert table_of_points(Q, TIPS.points, None).poses is None
+    assert dc.Measurements.of_points(Q, TIPS.points, None, None).poses is None
 
 
 @pytest.mark.parametrize(("lever", "table"), [(None, MARKERS), (LEVER, TIPS)])
 def test_origins_are_linear_in_points(lever: float | None, table: dc.Measurements) -> None:
     flat = table.points.flatten(1)
     expected = flat if lever is None else POSES[..., :3, 3].flatten(1)
-    assert_close(flat @ origins(lever, flat).mT, expected)
+    assert_close(flat @ bodies_of(lever).averaging(flat).mT, expected)
 
 
 def test_only_a_camera_on_the_tool_sees_a_board() -> None:
@@ -103,8 +117,6 @@ def test_only_a_camera_on_the_tool_sees_a_board() -> None:
 
 def test_a_row_in_a_socket_says_why_it_is_far() -> None:
     places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)[SOCKETS.places][:, None]
-    from diffeo_calib.measurements.rows import with_attributes
-
     placed = with_attributes(SOCKETS, points=places)
     predicted = places.clone()
     predicted[0] = torch.tensor([1.0, 1e-3, 0.0])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.fitting.objective import tangent
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.paper.eulerian import EulerianProblem
 from diffeo_calib.robots import elastic_rr

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diffeo_calib.runtime.profiles import PROFILES
-from diffeo_calib.runtime.tables import JointTables, PeriodicSum, tabulate
+from diffeo_calib.runtime.tables import PROFILES, JointTables, PeriodicSum, tabulate
 
 SMOOTH = [name for name in PROFILES if name != "matern32"]
 

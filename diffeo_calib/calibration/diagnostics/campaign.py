@@ -19,7 +19,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
-from diffeo_calib.kinematics.re_registration.undetermined import undetermined
+from diffeo_calib.kinematics.re_registration.registered_map import undetermined
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew

@@ -19,7 +19,6 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import LONGEST_NAME, InputError, sentence, shown, warn_user
-from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.table import Measurements
@@ -230,7 +229,7 @@ def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
 def _mirrored(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in a frame of the other hand."""
     words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
-    for mirrored in bodies_of(data).mirrored():
+    for mirrored in data.bodies.mirrored(data):
         yield Reading(robot, data.q, mirrored, words, on=data.on or ())
 
 

@@ -16,11 +16,15 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.identification.registration import can_register, register
-from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
-from diffeo_calib.calibration.identification.robust_registration import largest_distances, spread
+from diffeo_calib.calibration.identification.registration import (
+    ROBUST,
+    can_register,
+    largest_distances,
+    register,
+    spread,
+)
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -173,7 +177,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     own = largest_distances(registration.geometry, data)
     typical = float(own.median())
     geometry: Geometry | None = registration.geometry
-    if typical > REGISTRATION_LIMITS.consistent_residual * spread(data.points):
+    if typical > ROBUST.consistent_residual * spread(data.points):
         geometry, typical = _window(robot, data)
     elif int((own > STEP_LIMITS.gross * typical).sum()) < STEP_LIMITS.fewest_rows:
         return
@@ -204,7 +208,7 @@ def _refined(robot: Tree, data: Measurements, geometry: Geometry, typical: float
 
 def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
     """The first registration of consecutive rows that is consistent, and its median distance, m; None if none is."""
-    limit = REGISTRATION_LIMITS.consistent_residual * spread(data.points)
+    limit = ROBUST.consistent_residual * spread(data.points)
     for lag, rows in product(LIMITS.lags, _windows(data)):
         own, other = paired(data.line_numbers[rows], lag)
         if len(own) < LIMITS.fewest_rows:

@@ -65,7 +65,10 @@ BASE, MARKERS = "the measuring device or the robot's base", "a marker or the too
 SCALE = "the scale of the device or the size of the robot"
 NEW_SET_UP = "name the set-ups in a column (`session`), or use the rows before or after it"
 TWO_ROBOTS = "calibrate the rows before it, and recalibrate that model with the rows after it"
-SLOW = "let robot and device warm up, and measure in random order, so that the drift averages out"
+SLOW = (
+    "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
+    "measure in random order, so that the drift averages out"
+)
 
 
 class Cause(NamedTuple):

@@ -10,19 +10,19 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import LIMITS as PATH_LIMITS
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.identification.registration import SocketRegistration, socket_means
-from diffeo_calib.calibration.identification.robust_registration import distances
+from diffeo_calib.calibration.identification.registration import SocketRegistration, distances, socket_means
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.payload import check_unladen
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, check_devices
+from diffeo_calib.sensors.tables import sees_frame
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
     """
     if not tables:
         return
-    tip = tables[0].on
+    balls = [table for table in tables if not sees_frame(table)]
+    tip = balls[0].on if balls else robot.tips[0]
     if tip is None and len(robot.tips) > 1:
         fix = "name the tip that carries the ball (`with_tips`), or load the robot with that one"
         raise InputError.of("readings of a robot with several tips", expected="one", got=few(robot.tips), fix=fix)

@@ -84,13 +84,17 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
             known[rows] = own.noise_model.known
         if own.noise_model.kinds is not None:
             kinds[rows] = own.noise_model.kinds
-    first = 0 if own is None else own.noise_model.kind_count
-    ball = torch.arange(dim, device=q.device)[-3:]
+    first, modes = 0, None
+    if own is not None:
+        first, modes = own.noise_model.kind_count, _of_rows(own.noise_model.modes, own.rows, N)
+    every = torch.arange(dim, device=q.device)
     for kind, one in enumerate(readings, first):
-        place = one.rows[:, None], one.numbers
-        parts.append(Part(one.rows, ball, one.numbers, one.devices.observation(one.device)))
+        place, seen = (one.rows[:, None], one.numbers), every[-3 * one.devices.seen_points :]
+        parts.append(Part(one.rows, seen, one.numbers, one.devices.observation(one.device)))
         y[place], visible[place] = one.devices.values(one.data), True
         kinds[one.rows, 0] = kind
+        if modes is not None:
+            modes[one.rows[:, None], 0, one.numbers, one.numbers] = 1.0
         if one.data.std is not None:
             metres = one.devices.metres[one.device][:, None]
             known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
@@ -98,7 +102,7 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
         bodies,
         size,
         known if bool(known.any()) else None,
-        None if own is None else _of_rows(own.noise_model.modes, own.rows, N),
+        modes,
         0.0 if own is None else own.noise_model.slack,
         visible=None if bool(visible.all()) else visible,
         kinds=kinds if int(kinds.max()) else None,
@@ -162,7 +166,8 @@ class Placed:
     @property
     def ball(self) -> bool:
         """Whether no device measures positions of the last marker."""
-        return self.free or bool(self.readings) or self.placement.one(SocketDevices) is not None
+        balls = self.lever is None and bool(self.readings)
+        return self.free or balls or self.placement.one(SocketDevices) is not None
 
     @property
     def positions(self) -> Tensor | None:
@@ -195,7 +200,7 @@ class Placed:
         found = []
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
-            errors = [own.errors(one.data, stage(one.data.q).detach()[:, -1]) for own, one in pairs]
+            errors = [own.errors(one.data, own.points_of(stage(one.data.q).detach())) for own, one in pairs]
             found.append(float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt()))
         return found
 

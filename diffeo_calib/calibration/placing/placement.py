@@ -21,10 +21,11 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
@@ -119,11 +120,15 @@ class DeviceSet(ABC):
     def placed(self) -> PlacedDevices:
         """What a model keeps of them."""
 
-    def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
     def changes(self, data: SeenRows) -> Iterable[Cause]:
         """What of these devices may change during the measurements, with its effects (N, R, U) on all rows."""
+        return ()
+
+    def groups(self) -> Iterable[tuple[str, Tensor]]:
+        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
         return ()
 
     def doubts(self, data: SeenRows) -> Iterable[Cause]:
@@ -159,6 +164,10 @@ class Placement:
     def changes(self, data: SeenRows) -> list[Cause]:
         """What of all devices may change."""
         return [cause for own in self.sets for cause in own.changes(data)]
+
+    def groups(self) -> Iterable[tuple[str, Tensor]]:
+        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
+        return ()
 
     def doubts(self, data: SeenRows) -> list[Cause]:
         """What all devices are said to hold."""

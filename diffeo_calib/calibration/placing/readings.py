@@ -30,14 +30,13 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
-from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.placed import PlacedDevices
-from diffeo_calib.sensors.places import sensor_key
+from diffeo_calib.sensors.places import PlacedDevices, fitting_devices, sensor_key
 from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
@@ -79,20 +78,24 @@ class ReadingDevices(DeviceSet):
         """(M,) number of each row's device."""
         return self.devices.numbers(self.data)
 
+    def _seen(self, data: SeenRows) -> Tensor:
+        """(M, 3 k) coordinates of what the devices see, m."""
+        return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
+
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`."""
-        own = self.devices.shared(data.points[self.rows, -3:], self.device)
+        own = self.devices.shared(self._seen(data), self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
         found[self.rows[:, None], self.numbers] = own
         return found
 
     def changes(self, data: SeenRows) -> Iterator[Cause]:
         """See :class:`DeviceSet`: every device moved, or its zero was set anew."""
-        yield from self._causes(data, self.devices.changes(data.points[self.rows, -3:], self.device))
+        yield from self._causes(data, self.devices.changes(self._seen(data), self.device))
 
     def doubts(self, data: SeenRows) -> Iterator[Cause]:
         """See :class:`DeviceSet`."""
-        yield from self._causes(data, self.devices.doubts(data.points[self.rows, -3:], self.device))
+        yield from self._causes(data, self.devices.doubts(self._seen(data), self.device))
 
     def _causes(self, data: SeenRows, found: Iterable[Effect]) -> Iterator[Cause]:
         """Effects (M, r, U) on the rows of these devices as effects on all rows."""
@@ -114,10 +117,10 @@ class ReadingDevices(DeviceSet):
         self.devices.numbers(own.table)  # refuses other devices
         return replace(self, data=own.table, rows=own.rows)
 
-    def warn_of_weakness(self, fitted: FittedMap) -> None:
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
-        if fitted.workspace is not None:
-            expected = ExpectedError.of(fitted)
+        if model.map.workspace is not None:
+            expected = ExpectedError.of(model)
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:
@@ -130,7 +133,7 @@ class ReadingDevices(DeviceSet):
         prior = self.devices.deviations.expand(len(self.devices.names), -1)
         deviations = prior if self.known is None else self.known
         own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
-        return PlacedDevices(self.devices.kind, *own)
+        return PlacedDevices(self.devices.kind, *own, self.data.shown)
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
@@ -157,11 +160,13 @@ class FoundReadings:
     devices: tuple[Devices, ...]
 
 
-def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
+def identify_readings(
+    bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False, ball: Tensor | None = None
+) -> FoundReadings:
     """Find ball, devices and geometric errors.
 
     Args:
-        bare: the robot with one marker, the ball, whose place is not used. tables: readings, each of one kind.
+        bare: the robot with one marker, the ball, which is searched for from there. tables: readings, each of one kind.
         rigid: whether errors of joints stay zero.
 
     Raises:
@@ -173,7 +178,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
     for data, T in zip(tables, poses, strict=True):
         kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
-    found = _rough_fits(bare, tables, still, _starts(tables, poses))
+    found = _rough_fits(bare, tables, still, _starts(bare.tool[0], tables, poses))
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
         found += _rough_fits(bare, tables, still, [(ball, _around(ball, tables, poses)) for ball in balls])
@@ -210,6 +215,7 @@ def with_ball_of(
     readings: Sequence[Readings], table: Measurements, stages: tuple[Identification, Identification]
 ) -> tuple[Identification, Identification]:
     """Stages of rows that tell coordinates, with the ball of readings if these alone show it."""
+    readings = [own for own in readings if kind_of(own).seen_points == 1]
     if not readings or table.sockets is not None:
         return stages
     geometry, tip = stages[1].geometry, readings[0].on
@@ -219,18 +225,18 @@ def with_ball_of(
 
 
 def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devices, ...]:
-    """The devices of readings of the last marker of a robot, for each table."""
-    balls = [geometry.points(table.q)[:, -1] for table in tables]
-    return tuple(kind_of(own).at(own, ball).refined(own, ball) for own, ball in zip(tables, balls, strict=True))
+    """The devices of readings around a robot, for each table."""
+    return tuple(fitting_devices(own, geometry.points(own.q)) for own in tables)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
-    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings."""
-    if not readings:
-        return None
+    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings of a ball."""
     for one in readings:
         check_devices(one)
-    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (tip,))
+    readings = [own for own in readings if kind_of(own).seen_points == 1]
+    if not readings:
+        return None
+    bare = geometry.with_tool(geometry.tool[-1:], (tip,))
     return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
 
 
@@ -255,10 +261,9 @@ def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> Foun
     return _estimate(_Rows(geometry, tuple(tables)), devices, _deviations(geometry), found.registration)
 
 
-def _starts(tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
-    """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball at the tip."""
-    tip = torch.zeros(3, dtype=poses[0].dtype, device=poses[0].device)
-    found = [(tip, _around(tip, tables, poses))]
+def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
+    """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball where it was."""
+    found = [(usual, _around(usual, tables, poses))]
     for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
         rows = [data.device == number for number in range(len(data.names))]
         kind = kind_of(data)

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.identification.robust_registration import register_inliers
+from diffeo_calib.calibration.identification.registration import register, register_inliers
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed
@@ -24,12 +23,11 @@ from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-from diffeo_calib.sensors.placed import SESSION, PlacedDevices
-from diffeo_calib.sensors.places import check_rows_of_sessions, robust_fit
+from diffeo_calib.sensors.places import SESSION, PlacedDevices, check_rows_of_sessions, robust_fit
 from diffeo_calib.sensors.tables import Coordinates, measured_rows
 
 ROUNDS = 3
@@ -126,6 +124,10 @@ class SessionFrames(DeviceSet):
             MeasurementError: a session that is not known.
         """
         return data.in_frames(torch.linalg.inv(self.transforms)[self.numbers(data)])
+
+    def groups(self) -> list[tuple[str, Tensor]]:
+        """See :class:`DeviceSet`."""
+        return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
 
     @property
     def others(self) -> list[int]:

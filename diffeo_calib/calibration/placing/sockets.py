@@ -38,7 +38,6 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
@@ -47,10 +46,10 @@ from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
+from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
 
 ALIKE = 0.05
@@ -264,11 +263,11 @@ class SocketDevices(DeviceSet):
             found.append(PlaceErrors(name, len(rows), *_spread(predicted, self.socket[rows], sockets)))
         return tuple(found)
 
-    def warn_of_weakness(self, fitted: FittedMap) -> None:
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
         place = self.places.sockets.place
-        if fitted.workspace is not None:
-            warn_of_flat_places(fitted, self.positions, self.socket, place, self.workspace_deviation)
+        if model.map.workspace is not None:
+            warn_of_flat_places(model.map, self.positions, self.socket, place, self.workspace_deviation)
 
     @property
     def deviations(self) -> Tensor:

@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_number, check_seed
-from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError, as_written, few, listed
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree

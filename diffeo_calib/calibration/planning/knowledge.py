@@ -28,9 +28,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior, held_parameters
 from diffeo_calib.calibration.planning.sensors import Options, Scene
-from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import as_tensor
@@ -41,14 +41,14 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.bodies import origins, table_of_points
-from diffeo_calib.measurements.pose_frames import POINTS
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_memory
 from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import device_coordinates
@@ -278,7 +278,9 @@ def of_robot(
     data = replace(data, held=held_parameters(geometry) if adrift else ())
     features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
     noise = data.noise(scales)
-    scene = Scene(data.points, noise, geometry.base, origins(lever, noise), 3 * len(tool.points), free=adrift)
+    scene = Scene(
+        data.points, noise, geometry.base, bodies_of(lever).averaging(noise), 3 * len(tool.points), free=adrift
+    )
     return Start(data.linearisation(scales), [features], scene, noise.new_zeros(len(features.signs), 0))
 
 
@@ -317,8 +319,8 @@ def tool_of(robot: Tree, marker: object) -> Tool:
 
 def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: float) -> TangentData:
     """Configurations around the nominal geometry, to be measured with the usual noise."""
-    on = geometry.on[::POINTS] if len(set(geometry.on)) > 1 else None
-    data = table_of_points(q, geometry.points(q), lever, on)
+    on = geometry.on if len(set(geometry.on)) > 1 else None
+    data = Measurements.of_points(q, geometry.points(q), on, lever)
     nominal, sensor = GeometryMap(geometry, elastic=True), NoiseModel.of(data, residual)
     theta = q.new_zeros(nominal.parameters)
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
@@ -337,7 +339,7 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     points, parts = zip(*(fitted.geodesic.linearised_value(rows) for rows in groups), strict=True)
     features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
     noise, adrift = fitted.new_noise, fitted.workspace is not None
-    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), origins(model.lever, noise)
+    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
     seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
     shifts = noise.new_zeros(0, 0)
     if fitted.noise.shared.shape[2] and fitted.registration is None:

@@ -27,8 +27,8 @@ from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene,
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.columns import Columns

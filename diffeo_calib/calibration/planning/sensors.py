@@ -18,9 +18,10 @@ from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.places import PlacedDevices
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
@@ -66,6 +67,11 @@ class Scene(NamedTuple):
     def last(self) -> Tensor:
         """(3, m) the ball: the last marker, or the origin of the last measured pose."""
         return self.averaged[-3:]
+
+    def seen_by(self, devices: Devices) -> Tensor:
+        """(3 k, m) what devices of readings see: the ball, or the points of the last measured pose."""
+        whole = torch.eye(self.points.shape[1], dtype=self.points.dtype, device=self.points.device)
+        return self.last if devices.seen_points == 1 else whole[-3 * devices.seen_points :]
 
     @property
     def framed(self) -> bool:
@@ -251,7 +257,7 @@ class DeviceReadings(Sensor):
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
         """Devices that a user describes, see :attr:`Devices.stated_as`."""
-        own = KINDS[kind]
+        own = known_kinds()[kind]
         count = own.stated_as.count(",") + 1
         given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {own.stated_as} of each, in m")
         constants = own.stated(given)
@@ -266,15 +272,17 @@ class DeviceReadings(Sensor):
         return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
 
     def options(self, scene: Scene) -> Options:
-        """Every device at the configurations in which it sees the ball."""
+        """Every device at the configurations in which it sees the tool."""
         base = scene.base if self.columns is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
-        points = ((scene.points @ scene.last.mT) - base[:3, 3]) @ base[:3, :3]
+        last = scene.seen_by(self.devices)
+        points = (scene.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]
+        points, turn = (points @ base[:3, :3]).flatten(1), torch.block_diag(*[base[:3, :3].mT] * points.shape[1])
         count = len(self.devices.names)
         rows = torch.arange(len(points), device=points.device).repeat_interleave(count)
         device = torch.arange(count, device=points.device).repeat(len(points))
         seen = self.devices.sees(points[rows], device)
         rows, device = rows[seen], device[seen]
-        slopes = self.devices.observation(device).slope(points[rows]) @ base[:3, :3].mT @ scene.last
+        slopes = self.devices.observation(device).slope(points[rows]) @ turn @ last
         own = self.devices.shared(points[rows], device)
         if self.columns is None:
             shared = self._new(scene, own)
@@ -329,21 +337,39 @@ class InSockets(Sensor):
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     """What the rows of a model were measured with, devices of readings and sockets where the fit found them.
 
-    Read off the map, which keeps the slopes of its rows and the effects of its devices.
+    Where the model does not know its devices (files of old versions, and registered models) they are read off the map,
+    which keeps the slopes of its rows and the effects of its devices.
     """
-    fitted, q = model.map, model.configurations
+    fitted, q, known = model.map, model.configurations, _known_devices(model)
     shared, visible = fitted.noise.shared, fitted.noise.visible
     moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
     read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
+    for rows, _ in known:
+        read[rows] = True
     resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & of_ball
     device = Positions(whole=model.lever is not None)
     found: list[Sensor] = [device] if bool((~read & ~resting).any()) else []
     if bool(resting.any()):
         found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
+    if known:
+        return (*found, *(DeviceReadings(None, devices, moved[rows].any(0)) for rows, devices in known))
     for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
-        found.append(_device(model, (rows, own), f" {len(found) + 1}"))
+        found.append(_device(model, (rows, own), _name(model, rows)))
     return tuple(found)
+
+
+def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
+    """Every device of readings of a model by itself, and the rows (M,) of the fit that it measured."""
+    found, noise = [], model.map.noise
+    for one in model.placement:
+        for number in one.device.unique().tolist() if one.devices is not None else ():
+            rows, kind = one.rows[one.device == number].to(noise.shared.device), known_kinds()[one.kind]
+            effects = noise.shared[rows[0], noise.visible[rows[0]]]
+            offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
+            prior, name = one.constants.new_tensor(kind.prior(offset)), _called(model, one, number)
+            found.append((rows, kind((name,), one.constants[number, None], prior)))
+    return found
 
 
 def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
@@ -354,21 +380,40 @@ def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
     return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
 
 
-def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
+def _name(model: CalibratedKinematics, rows: Tensor) -> str:
+    """Name of the device that measured some rows (N,) of a fit, after its kind where another kind has the same name.
+
+    Files of old versions hold no names.
+    """
+    first = int(rows.nonzero()[0, 0])
+    for own in model.placement:
+        for name, row in zip([own.names[number] for number in own.device.tolist()], own.rows.tolist(), strict=True):
+            if row == first:
+                return _called(model, own, own.names.index(name))
+    return f"device of row {first}"
+
+
+def _called(model: CalibratedKinematics, own: PlacedDevices, number: int) -> str:
+    """Name of a device, after its kind where another kind has the same name."""
+    name = own.names[number]
+    return name if sum(name in other.names for other in model.placement) == 1 else f"{own.kind} {name}"
+
+
+def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) -> DeviceReadings:
     """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects."""
     (rows, columns), fitted = own, model.map
     if fitted.slopes is None:
         raise InputError.of("a model of readings", expected="slopes of its rows")
     numbers, ball = fitted.noise.visible[rows][0], model(model.configurations[rows]).detach()[:, -1]
     slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
-    for kind in KINDS.values():
+    for kind in known_kinds().values():
         deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
         if len(deviations) != effects.shape[2]:
             continue
         constants = kind.seen_by(slopes, effects / deviations, ball)
         if constants is None:
             continue
-        devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
+        devices = kind((name,), constants[None], deviations)
         again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
             return DeviceReadings(None, devices, columns)

@@ -1,4 +1,4 @@
-"""What has changed since a robot was calibrated: likelihood ratios for every joint, for its load and its geometry.
+"""What has changed since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
 
 The residuals r of new rows are N(0, K_0) if only device and markers have moved; if part k has changed, too, they are
 N(0, K_0 + s^2 G_k), with G_k the covariance of that part in the old model and s^2 the variance of the change relative
@@ -16,14 +16,15 @@ extrapolation, not change.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.judgement import find_block
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.linearisation import Linearisation
@@ -114,6 +115,8 @@ class _Density:
 
 SMALLEST_AMPLITUDE_SHARE = 0.5
 """A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
+OFFSET_DEVIATION_RAD_M = 3e-4
+"""Of a joint offset, to which the sizes above are relative: they span 0.05 to 5 mrad."""
 NEGLIGIBLE = 1e-6
 """Eigenvalues of a transmission's covariance below this share of the largest are left out."""
 
@@ -197,8 +200,33 @@ class Parameters(ChangedPart):
         return self.displacement(at, whole, mu)
 
 
+@dataclass(frozen=True, eq=False)
+class Offset(ChangedPart):
+    """The offset of one joint, by which all its values differ from before: a new zero, a slipped gear.
+
+    Args:
+        joint: its column.
+    """
+
+    joint: int
+
+    def root(self, at: Linearisation) -> Tensor:
+        """See :class:`ChangedPart`."""
+        return OFFSET_DEVIATION_RAD_M * at.joint_to_start[:, :, self.joint, None]
+
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """In rad or m, with its sign."""
+        return OFFSET_DEVIATION_RAD_M * float(torch.einsum("imc,im->c", self.root(at), mu))
+
+
+def offsets_of(rows: NewRows) -> list[ChangedPart]:
+    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
+    chain = rows.points.fitted.geometry.chain
+    return [Offset(f"the offset of {name}", joint) for joint, name in enumerate(chain.joint_names)]
+
+
 def parts_of(rows: NewRows) -> list[ChangedPart]:
-    """The parts that are tested: every joint with a transmission term, gravity, geometry."""
+    """The parts of the model: every joint with a transmission term, gravity, geometry."""
     spec, nominal = rows.fitted.geodesic.spec, rows.points.fitted
     chain, prior = nominal.geometry.chain, spec.prior_variance
     own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
@@ -219,6 +247,10 @@ def parts_of(rows: NewRows) -> list[ChangedPart]:
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""
 FEWEST_ROWS = 5
+TOLD_APART = 4.0
+"""Difference of likelihood ratios up to which the rows do not tell two offsets apart."""
+MOST_OUTLIERS = 0.5
+"""Share of the rows of a session that hardly count, from which it deviates as a whole."""
 RANGE_MARGIN = 0.02
 """Rows may lie outside of the old joint ranges by this share of them."""
 
@@ -229,10 +261,14 @@ class Change:
 
     Args:
         part: name of the joint, "gravity" or "geometry".
-        size: RMS of the change over the new rows: rad or m of a joint, m of the markers for other parts.
+        size: RMS of the change over the new rows: rad or m of a joint, m of the markers for other parts. Of an offset
+            the offset itself, with its sign.
         angle: whether the size is in rad.
         displacement: RMS displacement of the markers by it, m.
         probability: that chance makes any likelihood ratio as large.
+        deviation: standard deviation of an offset; None for other parts.
+        others: offsets that explain the rows as well.
+        where: the rows that show it, in words; empty if all do.
     """
 
     part: str
@@ -240,13 +276,22 @@ class Change:
     angle: bool
     displacement: float
     probability: float
+    deviation: float | None = None
+    others: tuple[str, ...] = ()
+    where: str = ""
 
     def __str__(self) -> str:
-        size = f"{1e3 * self.size:.2g} mm"
+        return f"{self.where}: {self._what}" if self.where else self._what
+
+    @property
+    def _what(self) -> str:
+        sign, within = ("", "") if self.deviation is None else ("+", f" +- {1e3 * self.deviation:.1g}")
+        size = f"{1e3 * self.size:{sign}.2g}{within} mm"
         if self.angle:
-            size = f"{1e3 * self.size:.2g} mrad ({degrees(self.size):.2g} degrees)"
+            size = f"{1e3 * self.size:{sign}.2g}{within} mrad ({degrees(self.size):.2g} degrees)"
         by = f", which moves the markers by {1e3 * self.displacement:.2g} mm" if self.angle else ""
-        return f"{self.part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
+        part = " or ".join((self.part, *self.others)) + " (these rows do not tell which)" * bool(self.others)
+        return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
 @dataclass(frozen=True)
@@ -278,7 +323,8 @@ class Changes:
         if not self.probabilities:
             return f"only {self.rows} rows lie within the joint ranges that the model knows: changes were not tested"
         if not self.found:
-            return f"no change was found but the places of device and markers (tested at {100 * self.level:g} %)"
+            places = "the places of device and markers, which may hide an offset of the first or the last joint"
+            return f"no change was found but {places} (tested at {100 * self.level:g} %)"
         return "; ".join(map(str, self.found))
 
 
@@ -289,23 +335,75 @@ class Drift(NamedTuple):
     variance: float
 
 
+SOMETHING = "something"
+"""A change whose part rows do not tell."""
+
+
 def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
-    """Test new rows for changes.
+    """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
+
+    Rows that follow one another, or are a session of their own, and deviate together are no outliers.
 
     Args:
         rows: seen by the old model. level: see :class:`Changes`. seed: of the samples.
 
     Returns:
-        what was found, and what may drift.
+        what was found, and what may drift: nothing where only a part of the rows shows a change.
     """
+    changes, drifts = _changes_of(rows, level=level, seed=seed)
+    groups = groups_of(rows)
+    if changes.found or not groups:
+        return changes, drifts
+    found = []
+    for where, group in groups.items():
+        own, _ = _changes_of(rows.kept(group.rows), level=level / len(groups), seed=seed)
+        found += [replace(one, where=where) for one in own.found]
+        if group.deviates and not own.found:
+            found.append(_unknown(rows.kept(group.rows), where, level))
+    return replace(changes, found=tuple(found)), []
+
+
+class Group(NamedTuple):
+    """Rows that were measured together: their numbers, and whether hardly any of them fits the old model."""
+
+    rows: Tensor
+    deviates: bool
+
+
+def groups_of(rows: NewRows) -> dict[str, Group]:
+    """Sessions, if there are several, and else the block of rows that hardly count, by their names."""
+    data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
+    named = [group for one in rows.before.sessions for group in one.groups()]
+    if named:
+        return {name: Group(own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
+    numbers = (
+        data.line_numbers if len(data.line_numbers.unique()) == len(data) else torch.arange(len(data), device=HOST)
+    )
+    order = numbers.to(HOST).argsort()
+    place = find_block(flags[order])
+    if place is None or place[1] - place[0] < FEWEST_ROWS:
+        return {}
+    block = order[place[0] : place[1]]
+    lines = numbers[block].tolist()
+    return {f"rows {lines[0]} to {lines[-1]}": Group(block, deviates=True)}
+
+
+def _unknown(rows: NewRows, where: str, level: float) -> Change:
+    """A change of rows that deviate together, of no part that is known."""
+    size = rows.rms(rows.residual)
+    return Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where)
+
+
+def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
+    """Test rows together; arguments as of :func:`find_changes`."""
     rows = rows.kept(within_old_range(rows))
     if len(rows) < FEWEST_ROWS:
         return Changes((), {}, 1.0, len(rows), level), []
-    parts = {part.name: part for part in parts_of(rows)}
+    parts = {part.name: part for part in (*parts_of(rows), *offsets_of(rows))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
     rows = rows.changed(tails=rows.if_drifting(list(roots.values())).tails)
     base, drifts, found = rows.posterior, [], {}
-    first, noise = {}, 1.0
+    first, others, noise = {}, {}, 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, base, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
@@ -321,8 +419,12 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
         base = base + ratios[name].variance * (root @ root.T)
         drifts.append(Drift(parts[name], ratios[name].variance))
         found[name] = ratios[name]
-    mu = torch.linalg.solve(Noise(rows.weighted_noise).add_to(base), rows.residual.flatten()).view_as(rows.y)
-    changes = tuple(_change(rows, mu, drift, found[drift.part.name]) for drift in drifts)
+        others[name] = _as_good(name, ratios, parts)
+    factor = torch.linalg.cholesky(Noise(rows.weighted_noise).add_to(base))
+    changes = tuple(
+        replace(_change(rows, factor, drift, found[drift.part.name]), others=others[drift.part.name])
+        for drift in drifts
+    )
     probabilities = {name: ratio.probability for name, ratio in first.items()}
     return Changes(changes, probabilities, noise, len(rows), level), drifts
 
@@ -334,11 +436,27 @@ def within_old_range(rows: NewRows) -> Tensor:
     return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
-def _change(rows: NewRows, mu: Tensor, drift: Drift, ratio: Ratio) -> Change:
-    """The change with its expected size."""
+def _as_good(name: str, ratios: dict[str, Ratio], parts: dict[str, ChangedPart]) -> tuple[str, ...]:
+    """Other offsets that explain the rows as well as that of this name."""
+    if not isinstance(parts[name], Offset):
+        return ()
+    least = ratios[name].value - TOLD_APART
+    return tuple(
+        each for each in ratios if each != name and isinstance(parts[each], Offset) and ratios[each].value > least
+    )
+
+
+def _change(rows: NewRows, factor: Tensor, drift: Drift, ratio: Ratio) -> Change:
+    """The change with its expected size; ``factor``: Cholesky factor of the covariance of all rows."""
+    mu = torch.cholesky_solve(rows.residual.flatten()[:, None], factor).view_as(rows.y)
     part, scaled = drift.part, drift.variance * mu
     kinds = rows.points.fitted.geometry.chain.kinds
-    angle = isinstance(part, Transmission) and kinds[part.joint] != "prismatic"
-    whole = rows.seen[1]
+    angle = isinstance(part, (Transmission, Offset)) and kinds[part.joint] != "prismatic"
+    whole, root = rows.seen[1], part.root(rows.at)
     size, displacement = part.size(rows.at, whole, scaled), part.displacement(rows.at, whole, scaled)
-    return Change(part.name, size, angle, displacement, ratio.probability)
+    deviation = None
+    if isinstance(part, Offset):
+        white = torch.linalg.solve_triangular(factor, root.flatten()[:, None], upper=False)
+        share = drift.variance * float(white.square().sum())
+        deviation = OFFSET_DEVIATION_RAD_M * (drift.variance * max(1.0 - share, 0.0)) ** 0.5
+    return Change(part.name, size, angle, displacement, ratio.probability, deviation)

@@ -18,17 +18,15 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
 )
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
-from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.measurements.bodies import table_of_points
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 
 GEODESIC_ROWS = 80
@@ -183,7 +181,7 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
     """The map of a model, with device and markers where another model of the robot has them."""
     own = model.to(HOST)
-    virtual = table_of_points(q, other(q), other.lever).with_load(own.nominal.load)
+    virtual = Measurements.of_points(q, other(q), None, other.lever).with_load(own.nominal.load)
     fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)

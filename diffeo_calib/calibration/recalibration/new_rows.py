@@ -29,13 +29,17 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.regions import region_scale
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.sensors.places import fitting_devices
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
+OUTLIER_WEIGHT = 0.2
+"""Rows with a smaller weight hardly count."""
 NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
 """Factors on the variance of the noise of devices that the old fit does not know."""
 NOISE_EFOLDS = 2.0
@@ -349,12 +353,11 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if before.coordinates is None:
         raise AssertionError("rows that tell coordinates")
     (new, rows), T, fitted = before.coordinates, before.transform, before.fitted
-    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
-    noise = block.expand(len(new), -1, -1)
+    table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
+    noise = usual_noise(fitted, table)
     if new.covariance is not None:
         turn = torch.block_diag(*[T[:3, :3]] * new.markers)
         noise = larger(noise, turn.mT @ new.covariance @ turn)
-    table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
     sets, table = SocketDevices.around(table, rows, seen)
     y = table.points.flatten(1)
     sensor = replace(NoiseModel.of(table, 0.0), known=None)
@@ -366,8 +369,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
 
 def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
     """The devices of readings around the points of the old model."""
-    ball = seen[rows, -3:]
-    devices = kind_of(table).at(table, ball).refined(table, ball)
+    devices = fitting_devices(table, seen[rows].unflatten(1, (-1, 3)))
     return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
 
 
@@ -396,6 +398,26 @@ def device_shifts(
     if before.place is None:
         return markers
     return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)
+
+
+def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
+    """(M, m, m) noise of new rows in the model's frame, m^2: that of usual rows of the fit.
+
+    Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
+    each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
+    """
+    bodies, whole = new.bodies, fitted.slopes is None and bool(fitted.noise.visible.all())
+    own, old = bodies.modes(new), bodies.modes_of(new, fitted.measured().unflatten(1, (-1, 3))) if whole else None
+    if own is None or old is None:
+        block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
+        return block.expand(len(new), -1, -1)
+    blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
+    to_modes = torch.linalg.pinv(old)
+    sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
+    eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
+    apart = eye - old @ to_modes
+    slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
+    return block_diagonal((own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye)
 
 
 def typical_noise(noise: Noise) -> Tensor:

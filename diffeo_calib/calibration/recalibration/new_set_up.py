@@ -31,7 +31,7 @@ from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.tables import (
     Coordinates,

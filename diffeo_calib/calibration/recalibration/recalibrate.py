@@ -23,9 +23,8 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.drift import usual_drift
-from diffeo_calib.calibration.recalibration.fit_both import fit_both
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
     Marker,
@@ -39,17 +38,15 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.register_again import warn_about
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
+from diffeo_calib.robots.placement import PLACES
 
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
@@ -159,6 +156,7 @@ def recalibrate(
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
     LOG.info("changes: %s", changes)
+    warn_of_groups(changes)
     found = before.registration
     if found is not None:
         warn_about(found, outliers=False, excess=not drifts)
@@ -269,8 +267,6 @@ def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
     return rows.levelled([part.root(rows.at) for part in parts_of(rows)])
 
 
-OUTLIER_WEIGHT = 0.2
-"""Rows with a smaller weight are named."""
 LARGEST_OUTLIER_PART = 0.5
 """Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
 LARGEST_EXCESS = 10.0
@@ -289,6 +285,14 @@ def warn_of_scale(rows: NewRows) -> None:
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
         warn_user(sentence(what, fix="check the scale of the measuring device"))
+
+
+def warn_of_groups(changes: Changes) -> None:
+    """Warn of changes that only a part of the new rows shows: no model holds for all of them."""
+    groups = dict.fromkeys(one.where for one in changes.found if one.where)
+    if groups:
+        what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
+        warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
 
 
 def check_rows(rows: NewRows, excess: float) -> None:

@@ -63,7 +63,7 @@ FEWEST_PLACES = 2
 
 
 def cross_validated_inflation(
-    centre: Hyperparameters,
+    centre: Hyperparameters | None,
     scales: Hyperparameters,
     data: TangentData,
     groups: Tensor,
@@ -75,7 +75,8 @@ def cross_validated_inflation(
     """Factor on all variances with which 95 % regions hold rows outside of the fit, see above.
 
     Args:
-        centre: default scales. scales: the selected ones. data: the measurements.
+        centre: default scales; None for scales of other robots, for which all rows are new.
+        scales: the selected ones. data: the measurements.
         groups: (N,) a number for each configuration, the same for its repeats.
         seed: draws the folds, as it drew the sample on which the scales were selected.
         limits: size of the cross-validation.
@@ -86,10 +87,10 @@ def cross_validated_inflation(
     """
     chosen, _ = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
     new = torch.ones(len(data.x), dtype=torch.bool, device=data.x.device)
-    new[chosen] = False
+    new[chosen] = centre is None
     rows, data = data.sample(len(data.x), limits.coordinates, seed)
     numbers, new = motions(data.x, groups[rows], limits), new[rows]
-    if len(numbers[new].unique()) >= limits.outside:
+    if centre is None or len(numbers[new].unique()) >= limits.outside:
         squares = left_out_squares(data, scales, [(numbers == k).nonzero()[:, 0] for k in numbers[new].unique()])
         squares[~new] = nan
     else:

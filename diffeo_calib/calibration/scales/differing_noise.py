@@ -71,8 +71,11 @@ def _typical(data: TangentData, noise: NoiseModel, jacobian: Tensor, scales: Hyp
 
 
 def noise_of_new_rows(data: TangentData, scales: Hyperparameters) -> Tensor:
-    """(N, m, m) covariance of new measurements like these rows, m^2, as predictions have it."""
+    """(N, m, m) covariance of new measurements like these rows, m^2, as predictions have it.
+
+    Rows with known deviations keep their own: the mean over images, say, is the noise of none of them.
+    """
     own = data.noise(scales)
-    if data.observe is not None:
+    if data.observe is not None or data.noise_model.known is not None:
         return own * region_factor(data.tails.freedom, data.noise_model.largest_freedom)
     return without_hidden(new_noise(data, scales).expand_as(own), data.visible)

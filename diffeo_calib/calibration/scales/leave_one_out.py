@@ -21,7 +21,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight, weighed
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 

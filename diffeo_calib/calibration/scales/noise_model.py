@@ -30,9 +30,10 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
-from diffeo_calib.measurements.bodies import bodies_of, seen_board
+from diffeo_calib.measurements.bodies import seen_board
 from diffeo_calib.measurements.pose_frames import block_diagonal, inverse_poses, own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
@@ -40,8 +41,22 @@ from diffeo_calib.measurements.table import Measurements
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
+FREEDOM_OF_POSES = 6
 SLACK_SHARE = 0.1
 """Noise of the single points of a pose, relative to the residual of the geometric calibration."""
+
+
+def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
+    """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
+
+    A larger slack would drown what images of a board tell across the line of sight: a hundredth of the error along it.
+    """
+    size = 0 if known is None else known.shape[1] // bodies
+    if known is None or size < FREEDOM_OF_POSES:
+        return otherwise
+    smallest = torch.linalg.eigvalsh(own_blocks(known, bodies))[..., -FREEDOM_OF_POSES]
+    smallest = smallest[smallest > SMALLEST_NOISE_M**2]
+    return float(smallest.median().sqrt()) if len(smallest) else otherwise
 
 
 @dataclass(frozen=True)
@@ -53,7 +68,7 @@ class NoiseModel:
         size: F, numbers of each body: 3 coordinates of a marker, 9 of the three points of a pose.
         known: (N, R, R) covariance that is known beforehand, m^2, or None.
         modes: (N, T, F, 6) displacements of the numbers of the first T bodies, poses, by a shift and a turn, zero where
-            one is hidden; None if no poses were measured.
+            one is hidden; each number by itself where a row reports something else; None if no poses were measured.
         slack: standard deviation of the single points of a pose, m.
         smallest_noise: standard deviation that is added to every number, m.
         visible: (N, R) boolean: the numbers that were measured; None if all were.
@@ -74,9 +89,11 @@ class NoiseModel:
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
-        seen = bodies_of(data)
-        own = seen.count, 3 * seen.points, data.covariance, seen.modes, SLACK_SHARE * residual
-        return cls(*own, visible=visible, kinds=seen.kinds)
+        size, known = data.bodies.points, data.covariance
+        count = data.markers // size
+        slack = min(SLACK_SHARE * residual, _precision(known, count, residual))
+        own = count, 3 * size, known, data.bodies.modes(data), slack
+        return cls(*own, visible=visible, kinds=data.body_kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
@@ -114,7 +131,8 @@ class NoiseModel:
         if self.visible is None or self.seen is None:
             raise InputError.of("poses beside other bodies", expected="which numbers were measured")
         own = self.visible.unflatten(1, (self.bodies, -1)).sum(2)
-        own[:, :poses] = 6 * self.seen[:, :poses]
+        if self.modes is not None:
+            own[:, :poses] = (self.modes != 0.0).any(2).sum(2)
         usual = int(own.max())
         return usual if bool(((own == usual) | (own == 0)).all()) else own.clamp(min=1)
 
@@ -156,11 +174,19 @@ class NoiseModel:
         total = jacobian * scales.joint_noise.square() @ jacobian.mT + self.smallest_noise**2 * eye
         if self.modes is None:
             return total + self._of_points(scales, eye)
-        if self.modes.shape[1] == self.bodies:
+        if self.modes.shape[1] == self.bodies and self.kinds is None:
             return total + self._of_poses(scales, jacobian) + self.slack**2 * eye
-        posed = torch.arange(count, device=eye.device) < self.modes.shape[1] * count // self.bodies
+        posed = self._posed(count)[:, :, None]
         single = self._of_points(scales, eye) * ~posed
         return total + self._of_poses(scales, jacobian) + self.slack**2 * eye * posed + single
+
+    def _posed(self, count: int) -> Tensor:
+        """(N, R) boolean: the numbers of poses."""
+        if self.modes is None:
+            return torch.zeros(1, count, dtype=torch.bool, device=HOST)
+        posed = torch.arange(self.bodies, device=self.modes.device)[None] < self.modes.shape[1]
+        posed = posed if self.kinds is None else posed & (self.kinds == 0)
+        return posed.repeat_interleave(count // self.bodies, 1)
 
     def _of_points(self, scales: Hyperparameters, eye: Tensor) -> Tensor:
         """Independent noise of every number: (R, R), or (N, R, R) with several kinds of devices."""
@@ -176,7 +202,10 @@ class NoiseModel:
         if self.modes is None:
             return jacobian.new_zeros(N, R, R)
         size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
-        own = block_diagonal((self.modes * size.square()) @ self.modes.mT)
+        own = (self.modes * size.square()) @ self.modes.mT
+        if self.kinds is not None:
+            own = own * (self.kinds == 0)[:, : own.shape[1], None, None]
+        own = block_diagonal(own)
         rest = R - own.shape[1]
         return own if rest == 0 else torch.nn.functional.pad(own, (0, rest, 0, rest))
 
@@ -199,7 +228,7 @@ class NoiseModel:
         if self.modes is not None and self.modes.shape[1] == self.bodies:
             to_body = torch.linalg.pinv(self.modes)  # (N, T, 6, 9)
             blocks = [to_body @ matrix @ to_body.mT for matrix in blocks]
-            absent = None if seen is None else ~seen[..., None].expand(*seen.shape, 6)
+            absent = None if seen is None else (self.modes == 0.0).all(2)
         else:
             absent = None if self.visible is None else ~self.visible.unflatten(1, (self.bodies, -1))
         if absent is not None:

@@ -16,8 +16,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
-from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOfKernels
+from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters, SeparateKernels, SumOfKernels
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
@@ -31,7 +30,7 @@ from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
-from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import PLACES
 
 T = TypeVar("T")
 HELD_VARIANCE = 1e-18

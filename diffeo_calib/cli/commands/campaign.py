@@ -10,8 +10,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 
 import typer
@@ -29,10 +32,13 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints
+from diffeo_calib.reports.live import Page, served
 
 JOURNAL = ".journal"
 """Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
+SHOWN_ROWS, SHOWN_POSES = 8, 500
+"""On the page: the last rows, and poses."""
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided")
 """What a journal keeps of a verdict."""
 
@@ -46,10 +52,14 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     goal = None if limit is None else limit.value
-    with Journal(source.csv.with_name(source.csv.name + JOURNAL)) as journal:
+    with ExitStack() as stack:
+        journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         live = Live(Campaign(robot, candidates=candidates, background=not given.once), source, links.tips, journal)
         live.resume()
-        _follow(live, given, goal)
+        page = None if given.page is None else stack.enter_context(served(given.page))
+        if page is not None:
+            say(f"the campaign is shown at {page.url}")
+        _follow(live, given, goal, page)
     known, accepted = live.campaign.expected_error, live.campaign.accepted
     record.add(rows=len(live.campaign), accepted=len(accepted), expected_error_m=known)
     if given.accepted is not None:
@@ -59,15 +69,48 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
         raise typer.Exit(EXIT_ABOVE)
 
 
-def _follow(live: Live, given: LiveOptions, goal: float | None) -> None:
+def _follow(live: Live, given: LiveOptions, goal: float | None, page: Page | None) -> None:
     """Judge rows as they come, until the goal is reached or there are no more."""
-    for line, last in _arriving(live, given):
-        live.add(line)
-        if live.reached(goal):
+    arriving = _arriving(live, given)
+    for line, last in arriving:
+        if line:
+            live.add(line)
+        decided = page is not None and live.decide(page.decisions)
+        if line and live.reached(goal):
             return
-        if last:
+        if last and (line or decided):
             say(f"  {live.outlook(given.next, goal)}")
+            if page is not None:
+                page.publish(state_of(live.campaign, live.outlook(1, goal), goal))
     live.campaign.wait()
+
+
+def state_of(campaign: Campaign, outlook: str, goal: float | None) -> dict[str, Any]:
+    """What the page shows: lengths in mm, places in m in the robot's base."""
+    robot, count, known = campaign.robot, len(campaign), campaign.expected_error
+    found = campaign.next(1, goal)
+    seen = [(one.row + 1, 1e3 * one.expected_error) for one in campaign.verdicts if one.expected_error is not None]
+    steps = [] if found is None else [(count + step, 1e3 * value) for step, value in enumerate(found.expected)]
+    next_q = campaign.candidates[:0] if found is None else found.q
+    verdicts = [
+        {"row": one.row, "text": str(one), "accepted": one.accepted, "fits": one.fits}
+        for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
+    ]
+    frames = robot.joint_frames(next_q)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(1, 0, 3)
+    tips = robot.tip_poses(next_q).flatten(1, -3)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(0, 1, 3)
+    done = robot.tip_poses(campaign.table.q[-SHOWN_POSES:]).flatten(1, -3)[:, 0, :3, 3]
+    return {
+        "error": None if known is None else 1e3 * known,
+        "state": f"{len(campaign.accepted)} of {count} rows accepted; {outlook.partition('; next')[0]}",
+        "pose": outlook.partition("; ")[2],
+        "goal": None if goal is None else 1e3 * goal,
+        "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
+        "forecast": steps,
+        "verdicts": verdicts,
+        "done": done.tolist(),
+        "next": tips[:, 0].tolist(),
+        "links": [*frames[0].tolist(), *tips[:, 0].tolist()],
+    }
 
 
 @dataclass
@@ -141,10 +184,15 @@ class Live:
         """The lines of some rows."""
         return [self.lines[number] for number in dict.fromkeys(self.owner[row] for row in rows)]
 
-    def decide(self, row: int, *, accepted: bool) -> None:
-        """The user accepts or rejects a row."""
-        (self.campaign.accept if accepted else self.campaign.reject)(row)
+    def decide(self, decisions: SimpleQueue[tuple[int, bool]]) -> bool:
+        """What the user decided about rows since the last time; whether there was anything."""
+        before = len(self.said), decisions.empty()
+        while not decisions.empty():
+            row, accepted = decisions.get()
+            if row < before[0]:
+                (self.campaign.accept if accepted else self.campaign.reject)(row)
         self.journal.add(self._revised())
+        return not before[1]
 
     def _revised(self) -> Iterator[dict[str, Any]]:
         """Entries of rows that are accepted now and were not, or the other way round."""
@@ -176,23 +224,37 @@ class Live:
 
 
 def _arriving(live: Live, given: LiveOptions) -> Iterator[tuple[bytes, bool]]:
-    """New lines as they come, and whether each is the last for now."""
-    texts = iter(sys.stdin) if given.stdin else None
+    """New lines as they come, and whether each is the last for now; empty ones while there are none."""
+    texts: SimpleQueue[str | None] = SimpleQueue()
+    if given.stdin:
+        Thread(target=_read_into, args=(texts,), daemon=True).start()
     while True:
         lines = live.new_lines()
         yield from ((line, number == len(lines)) for number, line in enumerate(lines, 1))
-        if texts is not None:
-            text = next(texts, None)
+        if given.once and not lines:
+            return
+        if not lines and not given.stdin:
+            time.sleep(LOOK_SECONDS)
+        if given.stdin:
+            try:
+                text = texts.get(timeout=LOOK_SECONDS)
+            except Empty:
+                text = ""
             if text is None:
                 return
             try:
-                append_row(live.source.csv, text, live.source.table.sep, live.source.table.decimal)
+                if text:
+                    append_row(live.source.csv, text, live.source.table.sep, live.source.table.decimal)
             except InputError as error:
                 say(f"left out: {error}")
-        elif given.once and not lines:
-            return
-        elif not lines:
-            time.sleep(LOOK_SECONDS)
+        yield b"", True
+
+
+def _read_into(texts: SimpleQueue[str | None]) -> None:
+    """Lines of standard input, and None at its end."""
+    for text in sys.stdin:
+        texts.put(text)
+    texts.put(None)
 
 
 def append_row(path: Path, text: str, sep: str, decimal: str) -> None:

@@ -43,7 +43,8 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
     )
     for line in () if found.moved is None else motion_lines(found.moved, model.on):
         say(line)
-    say(f"RMS {1e3 * found.rms:.4f} mm from the model after registration; {1e3 * found.expected:.4f} mm are expected")
+    where = "from the model, device and markers found anew"
+    say(f"RMS {1e3 * found.rms:.4f} mm {where}; {1e3 * found.expected:.4f} mm are expected")
     for line in change_lines(found.changes):
         say(line)
 

@@ -12,8 +12,8 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.options import Correction, Frame, Units
+from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
+from diffeo_calib.cli.options import Correction, Frame, StoredUnits
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
@@ -62,15 +62,16 @@ class ToolOnTip:
         return "tool" if self.place is None else f"tool on {self.tip}"
 
 
-def run(model: Path, program: Path, units: Units, options: Correction, output: Path) -> None:
-    """Read a program, correct it, write it and print a summary.
+def run(model: Path, program: Path, units: StoredUnits, options: Correction, output: Path) -> None:
+    """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit.
 
     Raises:
         InputError: options that contradict each other, columns that are missing or taken.
     """
-    source = ProgramTable.of(program, units, options)
-    kinematics, table = load_laden(model, options.payload), source.written()
     _check(options)
+    kinematics = load_laden(model, options.payload)
+    source = ProgramTable.of(program, as_fitted(kinematics, None, units)[1], options)
+    table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
     robot, tools, sheet = kinematics.robot, _tools(kinematics, options, table), Program.read(program, table)
@@ -274,4 +275,8 @@ def _miss(found: Compensation, tool: ToolOnTip, row: int) -> str:
 def _reason(found: Compensation, row: int) -> str:
     """A status, and what "unreachable" means: the largest correction is part of it."""
     status = found.status[row]
-    return "unreachable with corrections within --limit" if status == "unreachable" else str(status)
+    words = {
+        "unreachable": "unreachable with corrections within --limit",
+        "singular": "singular: near a singularity it needs a correction larger than --limit",
+    }
+    return words.get(str(status), str(status))

@@ -6,15 +6,13 @@ import math
 import shlex
 from pathlib import Path
 
-from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.interrupts import interrupts
+from diffeo_calib.cli.console import err, exit_on_interrupt, interrupts, progress_bar, say
 from diffeo_calib.cli.record import record
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.paper.algorithms import section_5
-from diffeo_calib.paper.figures import TEST_ROWS, mean_error, paper_figures
+from diffeo_calib.paper.figures import TEST_ROWS, mean_error, paper_figures, section_5
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

@@ -137,11 +137,10 @@ def _say_places(places: Places) -> None:
 
 
 def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
-    """Known distances, and the absolute error to expect where no position was measured."""
+    """Known distances, and the absolute error to expect."""
     for errors in found.values():
         yield from socket_lines(errors, "all rows")
-    if any(errors is not found.positions for errors in found.values()):
-        yield from expectation_lines(model, data)
+    yield from expectation_lines(model, data)
 
 
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
@@ -170,8 +169,8 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     for kind, after in kinds.items():
         table = ErrorTable(after, f"of {plain(name)}", "rows")
         if known:
-            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
-        table.add(after, f"{after.count} after registration")
+            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} with the places of the fit")
+        table.add(after, f"{after.count} with places found anew")
         out.print(table)
     for line in (*registration_lines(found), *placement_sentences(found)):
         say(plain(line))

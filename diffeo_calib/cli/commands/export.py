@@ -10,13 +10,12 @@ from pathlib import Path
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import expected_of, stands_free
+from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.options import Export
-from diffeo_calib.cli.places import make_folder
 from diffeo_calib.cli.printed import placement_lines
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files
@@ -220,7 +219,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     known = model.summary
     about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
     if stands_free(model):  # errors of the fit are spreads or those of readings, which flatter
-        about, new = expected_of(model), "true positions, about"
+        about, new = ExpectedError.of(model).whole, "true positions, about"
     title = f"Distance from the model over its {len(model.configurations)} measured configurations, mm"
     table = Table(title=title, title_justify="left")
     table.add_column("export")

@@ -11,12 +11,11 @@ import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.judgement import contradicted
+from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import KindErrors, errors_by_kind
-from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
-from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
+from diffeo_calib.cli.models import load_kinematics, made_by_command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -30,7 +29,7 @@ from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye
@@ -86,15 +85,15 @@ def run(
     seed: int,
     controls: int | None,
     note: str = "",
+    scales_of: Sequence[Path] = (),
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
-        chain = robot.read()
+        chain, others = robot.read(), [load_kinematics(path) for path in scales_of]
         data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-        number = "auto" if controls is None else controls
-        watched = interrupts.watching(progress, err.print)
-        result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
+        how = {"controls": controls or "auto", "seed": seed, "note": note, "scales_of": others}
+        result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
     hand_eye = hand_eye_of(result)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
@@ -114,8 +113,16 @@ def run(
     say(f"model: {outputs.model}")
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
+    _end(result, in_train, held_out or in_train)
+
+
+def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
+    """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
+    for kind, one in judged.items():
+        if one.one.what == ERRORS and kind in in_train:
+            check_errors(result.model, one.one, in_train[kind].stages["geometry"].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
@@ -151,8 +158,8 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    yield stage_line(result.model, result.stages)
-    yield from expectation_lines(result.model, data)
+    yield stage_line(result.model, result.stages, result.expected)
+    yield from expectation_lines(result.model, data, result.expected)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
@@ -187,7 +194,6 @@ def _record(
         **entries_by_kind(
             {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
         ),
-        expected_error=result.expected.entry(),
         lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
         leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
@@ -220,6 +226,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             if other is not None:
                 table.add(other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
+        if held_out is not None and other is None:
+            say("no row of this kind was held out: these are errors on rows that were fitted")
         if held_out is None and place == 0:
             measured = one.one.what == ERRORS
             left_out = f" (leave-one-out RMS {1e3 * result.left_out_rms:.4f} mm)" * measured

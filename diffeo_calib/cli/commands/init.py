@@ -10,15 +10,17 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.proposals import Sheet, guess_joints, guess_sheet
+from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
+from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload")
+COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading")
 """Entries that name columns."""
 
 
@@ -103,37 +105,43 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     """Units with which the nominal robot can explain the positions, or the sockets."""
     no_length = source.rows.without_length and all(source.robot.periodic)
     lengths = ("mm",) if no_length else ("m", "mm")
-    residuals: dict[tuple[str, str], float] = {}
-    for length, angle in product(lengths, ("rad", "deg")):
-        residuals[length, angle] = source.residual(TableFormat(length, angle, sheet.sep, sheet.decimal))
-    (length, angle), best = min(residuals.items(), key=lambda entry: entry[1])
-    others = min(value for units, value in residuals.items() if units != (length, angle))
+    residuals: dict[tuple[str, ...], float] = {}
+    cameras = ("", "camera on the tool") if source.rows.of_boards else ("",)
+    for length, angle, camera in product(lengths, ("rad", "deg"), cameras):
+        table = TableFormat(length, angle, sheet.sep, sheet.decimal, camera_on_tool=bool(camera))
+        residuals[length, angle, camera] = source.residual(table)
+    (length, angle, camera), best = min(residuals.items(), key=lambda entry: entry[1])
+    others = min(value for units, value in residuals.items() if units != (length, angle, camera))
     found = source.words(best, others)
     if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
         seen = [Choice(*entry) for entry in proposals.camera(source, sheet)]
         if seen:
             yield from seen
             return
-        got = "; ".join(f"{' and '.join(units)}: {source.size(value)}" for units, value in residuals.items())
+        got = "; ".join(
+            f"{' and '.join(filter(None, units))}: {source.size(value)}" for units, value in residuals.items()
+        )
         fix = (
-            "write the file yourself; `init` tries one tip, or those after which columns are named: several need `tip` "
-            "and `position` once for each"
+            "check the table's joints against the URDF, or write the file yourself; of a robot with several tips the "
+            "columns of each are to be named after it, such as left_x"
         )
         raise InputError.of(
             "units with which the robot explains the rows", expected="one clear reading", got=got, fix=fix
         )
     if no_length:
-        yield Choice("length", length, "of the distances of sockets: the table holds no length")
+        yield Choice("length", length, "of lengths that you add: the table holds none")
     else:
         yield Choice("length", length, found)
     yield Choice("angle", angle, found if no_length else "the same")
+    if camera:
+        yield Choice("camera-on-tool", True, "the same; else the board is on the tool")
 
 
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
-    columns += [str(choice.value).partition("=")[2] for choice in choices if choice.name == "reading"]
     texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
-    return {name for text in texts for name in text.split(",")}
+    corners = {IMAGE, *POINT, *PIXEL} if any(text.startswith(CORNERS) for text in texts) else set[str]()
+    return corners | {name for text in texts for name in text.rpartition("=")[2].split(",")}
 
 
 def _quoted(text: str) -> str:

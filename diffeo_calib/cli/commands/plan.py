@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import isfinite, pi, radians
 from pathlib import Path
@@ -18,6 +18,7 @@ from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned, StoredUnits
+from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
 from diffeo_calib.common.device import HOST
@@ -91,12 +92,21 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors))
+    for line in _lines_of_fit(source):
+        say(line)
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:
         say("its column `device`: what measures the pose")
         for line in [line for one in sensors for line in one.sentences()]:
             say(line)
+
+
+def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
+    """What a model expects over the joint ranges of its fit, and why the plan says another number."""
+    if isinstance(source, CalibratedKinematics):
+        yield "the table is of the poses drawn or given, perhaps beyond the fit's, and counts what its rows leave open"
+        yield from expectation_lines(source, None)
 
 
 def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:

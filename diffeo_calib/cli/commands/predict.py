@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
-from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.interrupts import Progress
+from diffeo_calib.cli.console import Progress, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, with_rows
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.evaluation import OutsideRange
-from diffeo_calib.measurements.body_kinds import body_kind
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
-from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import Predictions, write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 Block = TypeVar("Block", bound=Sized)
@@ -49,6 +52,8 @@ def counted(blocks: Iterable[Block], rows: int, progress: Progress) -> Iterator[
 def run(model: Path, given: TableOptions, output: Path) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
+    A payload that is a number is the mass of all rows.
+
     Raises:
         InputError: options of a rotation for a model that was calibrated with points.
     """
@@ -56,22 +61,29 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     for line in provenance_lines(kinematics):
         say(line)
     table, joints = _written_as_read(kinematics, given)
-    robot, with_poses, bodies = kinematics.robot, kinematics.lever is not None, body_kind(kinematics.lever)
+    robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
-    check_payload_column(kinematics, table.payload)
+    mass = number(table.payload or "", ".")
+    if mass is not None and isfinite(mass):
+        kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
+    else:
+        check_payload_column(kinematics, table.payload)
     prefixes = kinematics.bodies.prefixes(kinematics)
+    readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     write = write_pose_predictions if with_poses else write_predictions
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = ((rows.q, *_with_deviations(*bodies.predicted(rows.carried_by(kinematics), rows.q))) for rows in laden)
-        write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes)
+        blocks = (_predicted(readings, rows.carried_by(kinematics), rows.q) for rows in laden)
+        write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes, more=readings.names)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    for line in readings.sentences():
+        say(line)
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
@@ -112,6 +124,49 @@ def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     return f"{' '.join(options)} --convention {written.convention}{unit}"
 
 
-def _with_deviations(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Means and standard deviations of covariances: (..., k, k) -> (..., k)."""
-    return mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor) -> Predictions:
+    """Joint values, means and standard deviations of markers or poses, and cells of the devices' readings."""
+    mean, covariance = model.bodies.written(model, q)
+    return q, mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt(), readings.cells(model, q)
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """Columns of what devices will read, and of standard deviations; lengths in the unit of the table.
+
+    Args:
+        table: its format. devices: the readings of one configuration.
+    """
+
+    table: TableFormat
+    devices: Sequence[PredictedReadings]
+
+    def _unit(self, unit: str) -> tuple[str, float]:
+        """The unit that is written, and how many of it are one of the device's."""
+        metres = {"mm": 1e-3, "m": 1.0}.get(unit)
+        return (unit, 1.0) if metres is None else (self.table.length, metres * self.table.per_metre)
+
+    @property
+    def names(self) -> list[str]:
+        """KIND_DEVICE and std_KIND_DEVICE, of several numbers with _1, _2."""
+        found = []
+        for own in self.devices:
+            count = own.mean.shape[1]
+            ends = [""] if count == 1 else [f"_{k + 1}" for k in range(count)]
+            found += [f"{std}{own.kind}_{own.device}{end}" for std in ("", "std_") for end in ends]
+        return found
+
+    def cells(self, model: CalibratedKinematics, q: Tensor) -> Tensor:
+        """(B, k) means and standard deviations of every device."""
+        parts = [q[:, :0]]
+        for own in model.predict_readings(q) if self.devices else ():
+            parts += [self._unit(own.unit)[1] * values for values in (own.mean, own.deviations)]
+        return torch.cat(parts, 1)
+
+    def sentences(self) -> Iterator[str]:
+        """What the columns are, and how wide 95 % regions are."""
+        for own in self.devices:
+            numbers = own.mean.shape[1]
+            widths = f"within {chi2_above(0.05, numbers) ** 0.5:.2f} standard deviations"
+            unit = self._unit(own.unit)[0]
+            yield f"{own.kind}_{own.device}: what this device will read, in {unit}; 95 % of new readings are {widths}"

@@ -10,8 +10,7 @@ import typer
 from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
-from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import record
@@ -74,7 +73,7 @@ def _found(result: Recalibration) -> list[str]:
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
     lines = [
         f"the markers {markers[result.marker]}",
-        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model after registration, "
+        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model, device and markers found anew, "
         f"{1e3 * result.left_out_rms:.4f} mm if each is predicted by the old rows and the other new ones",
     ]
     if result.outliers:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.cli.commands.acceptance import parsed_limit
-from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.console import exit_on_interrupt, plain, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.options import Page
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
@@ -37,7 +37,9 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
     else:
         left_out = not found.new
         record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=dict(found.expected))
+    error = found.expected.error if isinstance(found, Findings) else found.deviations.error
     record.add(
+        expected_error=error.entry(),
         left_out=left_out,
         verdict=f"{judged(found, tolerance)}{words.verdict(found)}",
         advice=list(words.advice(found)),
@@ -47,4 +49,5 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
         each = "each predicted by all others" if isinstance(found, Findings) else "as fitted"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
     say(f"{judged(found, tolerance)}{words.verdict(found)}")
+    say(f"expected absolute error over the joint ranges of the fit: {plain(error.sentence)}")
     say(f"report: {output}")

@@ -26,7 +26,7 @@ from torch import Tensor
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Field, FieldAndJacobian, Formula, Gradient, HessianProduct, Points
-from diffeo_calib.kernels.reductions.reach import bandwidth, negligible_beyond
+from diffeo_calib.kernels.reductions.nearby import bandwidth, negligible_beyond
 
 MOST_WAVES = 1 << 16
 """Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.folder import cache_folder
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 
 CXXFLAGS = (
@@ -172,3 +171,11 @@ def _warned(text: str) -> None:
 def warn(error: KeopsUnavailableError) -> None:
     """Warn, once per reason, that the fallback runs."""
     _warned(f"{error} Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers.")
+
+
+def cache_folder(name: str) -> Path:
+    """A folder of this name in the user's cache, made if there is none."""
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = base / "diffeo_calib" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

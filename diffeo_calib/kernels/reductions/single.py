@@ -13,7 +13,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.fused.sums import FUSED
-from diffeo_calib.kernels.reductions.reach import DERIVATIVES
+from diffeo_calib.kernels.reductions.nearby import DERIVATIVES
 from diffeo_calib.kernels.reductions.tiled import CPU_ELEMENTS, GPU_ELEMENTS, Tiled
 
 ROUNDING = 2.0**-22

@@ -1,17 +1,19 @@
-"""All rows of a compensation as arrays, and their solution."""
+"""All rows of a compensation as arrays, and their solution.
+
+Why a target is not reached: the limit of a joint, a singularity, or because it is out of reach.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
-from diffeo_calib.kinematics.compensation.bounds import Limits
-from diffeo_calib.kinematics.compensation.box_search import box_search
+from diffeo_calib.kinematics.compensation.box_search import Limits, box_search
 from diffeo_calib.kinematics.compensation.chord import Box, chord_search
 from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions
-from diffeo_calib.kinematics.compensation.status import CODE, Judge, Room, Status
 from diffeo_calib.kinematics.compensation.targets import Array, Targets
 
 ROWS_AT_ONCE = 4096
@@ -104,3 +106,158 @@ class CompensationProblem:
 
     def _no_poses(self, count: int) -> Array:
         return np.full((count, *self.targets.pose_shape), np.nan)
+
+
+WEAK = 0.1
+"""A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
+BENT = 0.05
+"""The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
+FARTHER = 10.0
+"""Multiple of the bound within which targets beyond the end are searched once more."""
+DIFFERENCE = 1e-4
+"""Step in rad or m of central differences of the Jacobian."""
+
+ROUNDING = 1e-15
+"""Relative; so that the difference of command and start, too, is within the bound."""
+
+
+class Status(str, Enum):
+    """How a row ended.
+
+    ``reached``: the model at the command is at the target, to 1e-9 m and 1e-9 rad.
+    ``limit``: without the limits of its joints the robot would reach the target. Change the pose or the branch.
+    ``singular``: the arm is near a singularity, where a small correction needs a larger motion than the bound allows;
+    in other directions the bound would do. Accept the miss, raise the bound, or keep away from the singularity.
+    ``unreachable``: the target is beyond the robot's reach, where the arm is stretched, for instance, or farther from
+    the start than the bound allows. Check the target, its frame and unit, the tool, and the start.
+    ``rate``: on a path, the corrections may not change fast enough to reach this row.
+
+    Rows that are not reached have the command whose miss is smallest.
+    """
+
+    reached = "reached"
+    limit = "limit"
+    singular = "singular"
+    unreachable = "unreachable"
+    rate = "rate"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+MEMBERS = tuple(Status)
+CODE = {status: code for code, status in enumerate(MEMBERS)}
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """The parts of the boxes of N rows.
+
+    Args:
+        start: (N, n) rad or m. low: (n,) and
+        high: (n,) limits of the joints.
+        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
+    """
+
+    start: Array
+    low: Array
+    high: Array
+    bound: Array
+    mobility: Array
+
+    def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
+        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
+        start = self.start[rows]
+        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
+        low, high = start - motion, start + motion
+        if limited:
+            low, high = np.maximum(low, self.low), np.minimum(high, self.high)
+        return Box(start, low, high, self.mobility[rows])
+
+    def started(self, rows: Array, start: Array) -> Room:
+        """Of some rows (R,), from other starts (R, n)."""
+        return replace(self, start=start, mobility=self.mobility[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Says why rows are not reached.
+
+    Args:
+        tool: the calibrated kinematics. rough: those of its geometry.
+        targets: N targets. room: N boxes.
+    """
+
+    tool: ToolFunctions
+    rough: ToolFunctions
+    targets: Targets
+    room: Room
+
+    def codes(self, q: Array, poses: Array, done: Array) -> Array:
+        """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
+        codes = np.where(done, CODE[Status.reached], CODE[Status.unreachable])
+        rows = np.flatnonzero(~done)
+        if not len(rows):
+            return codes
+        at_limit = ((q[rows] <= self.room.low) | (q[rows] >= self.room.high)).any(1)
+        freed = rows[at_limit]
+        freed = freed[self._reach(freed, limited=False)]
+        codes[freed] = CODE[Status.limit]
+        rest = np.setdiff1d(rows, freed)
+        codes[rest[self._singular(rest, q[rest], poses[rest])]] = CODE[Status.singular]
+        return codes
+
+    def _reach(self, rows: Array, *, limited: bool, scale: float = 1.0) -> Array:
+        """(R,) whether rows reach their targets without the limits of their joints, or with a multiple of the bound."""
+        if not len(rows):
+            return np.zeros(0, dtype=bool)
+        box = self.room.box(rows, limited=limited, scale=scale)
+        return box_search(self.tool, self.targets.take(rows), np.clip(box.start, box.low, box.high), box)[2]
+
+    def _singular(self, rows: Array, q: Array, poses: Array) -> Array:
+        """(R,) whether a singularity is to blame, at the start or at the nearest command ``q``."""
+        if not len(rows):
+            return np.zeros(0, dtype=bool)
+        start, targets = self.room.start[rows], self.targets.take(rows)
+        near, open_ = self._blames(targets, start, self.tool.poses(start), start)
+        near_here, open_here = self._blames(targets, q, poses, start)
+        found = (near & open_) | (near_here & open_here)
+        doubtful = np.flatnonzero((near | near_here) & ~found)
+        found[doubtful] = self._reach(rows[doubtful], limited=True, scale=FARTHER)
+        return found
+
+    def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
+        """Whether weak directions at ``q`` (R, n) alone keep the bound from sufficing, and whether they lead there.
+
+        Along the direction v of the joints that moves the tool least, the tool goes s t + c t^2 / 2 in the direction u.
+        Where that bends back before it has gone as far as the target, the workspace probably ends before it.
+
+        Returns:
+            (R,) boolean each.
+        """
+        slopes = self._slopes(targets, q, poses)
+        error = targets.independent(targets.errors(poses) * targets.to_metres(self.tool.length))
+        U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
+        parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
+        weak = s <= WEAK * s[:, :1]
+        motion = parts / np.maximum(s, 1e-300)
+        strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.room.bound
+        each, main = np.arange(len(q)), np.where(weak, np.abs(motion), -1.0).argmax(1)
+        v, u, far, slope = Vt[each, main], U[each, :, main], parts[each, main], s[each, main]
+        bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.room.bound))
+        ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
+        length = self.tool.length * np.square(v * self.room.bound).sum(1)
+        ends &= np.abs(bend) > BENT * length
+        near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
+        return weak.any(1) & near, ~ends
+
+    def _bend(self, targets: Targets, q: Array, way: Array) -> Array:
+        """(R, k) second derivative of the tool along a way (R, n) of the joints."""
+        ends = [q + side * DIFFERENCE * way for side in (1.0, -1.0)]
+        speeds = [self._slopes(targets, at, self.rough.poses(at)) @ (way / self.room.bound)[:, :, None] for at in ends]
+        return (speeds[0] - speeds[1])[:, :, 0] / (2.0 * DIFFERENCE)
+
+    def _slopes(self, targets: Targets, q: Array, poses: Array) -> Array:
+        """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
+        slopes = targets.slopes(self.rough.jacobian(q), poses)
+        return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound

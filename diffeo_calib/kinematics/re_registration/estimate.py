@@ -33,13 +33,12 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates
+from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.regression.regions import region_scale
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.robots.placement import place, rigid_fit
+from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.bodies import Body
 
 MAX_STEPS = 100
 SETTLED = 1e-9
@@ -61,6 +60,7 @@ class Session:
         centre: (3,) about which the frame turns, m.
         known: (6 + d, 6 + d) covariance of frame and body from an earlier registration; zero without one.
         frame_free, body_free: what may have moved.
+        ball: whether the last point is a ball that no row shows: it stays where it was on the tool.
     """
 
     fitted: FittedMap
@@ -73,6 +73,7 @@ class Session:
     known: Tensor
     frame_free: bool
     body_free: bool
+    ball: bool = False
 
     def rows(self, keep: Tensor) -> Session:
         """The session with some of its rows."""
@@ -83,6 +84,7 @@ class Session:
         """Which of the unknowns are free, those of the frame and ``size`` of the body: (6 + size,) boolean."""
         free = torch.ones(6 + size, dtype=torch.bool, device=self.q.device)
         free[:6], free[6:] = self.frame_free, self.body_free
+        free[len(free) - 3 * self.ball :] = False
         return free
 
     def seen(self, T: Tensor) -> Tensor:
@@ -356,5 +358,6 @@ def anywhere(session: Session, body: Body) -> Place:
     poses = poses_from_marks(marks, TOOL_LEVER).view(-1, len(tips), 4, 4)
     carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * session.points.shape[1]
     found = place(poses[:, carrying], session.points)
-    placed = body.at(found.tool)
+    seen = len(found.tool) - session.ball
+    placed = body.at(torch.cat([found.tool[:seen], body.old[seen:]]))
     return Place(session, found.base, placed, session.view(placed))

@@ -1,34 +1,47 @@
-"""`model.registered`: estimates under several priors, outliers, and the record of what was found."""
+"""`model.registered`: estimates under several priors, outliers, and the record of what was found.
+
+Rows of a registration that contradict all others.
+
+Leaving rows J out lowers the quadratic form of the residuals by mu_J^T (K^-1)_JJ^-1 mu_J with K = V + S P S^T and
+mu = K^-1 r (r the residual minus S times the prior mean). Compared with what remains, this is an F test (externally
+studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then pairs, which may hide
+each other.
+"""
 
 from __future__ import annotations
 
 import logging
+from itertools import combinations
 from math import exp, nan
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.new_frame import moved, turned
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
-from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.registered_map import (
+    RegisteredMap,
+    Registration,
+    moved,
+    turned,
+    undetermined,
+)
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
-from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.place_priors import PLACES
-from diffeo_calib.sensors.bodies import Body
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
-from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -57,9 +70,10 @@ def register_again(
     *,
     free: str,
     marker_std: float | None,
+    ball: bool = False,
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std)
+    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std, ball=ball)
     registration = found.registration
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
@@ -88,14 +102,18 @@ def find_place(
     *,
     free: str = "both",
     marker_std: float | None = None,
+    ball: bool = False,
 ) -> FoundPlace:
-    """Find where the device stands and where the markers sit; arguments as of :func:`register_again`."""
+    """Find where the device stands and where the markers sit; arguments as of :func:`register_again`.
+
+    ``ball``: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+    """
     _check_arguments(nominal, data, free, marker_std)
     data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
     nominal = nominal.under(some.payload)
     model = model.with_nominal(nominal)
-    every = session_of(model, nominal, lever, some, free)
+    every = session_of(model, nominal, lever, some, free, ball=ball)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
     while True:
@@ -116,23 +134,16 @@ def find_place(
     return FoundPlace(registration, odds, found.best.inflation)
 
 
-def registration_rows(data: Any) -> Measurements | None:
-    """The rows of one set-up that say where the robot stands; None where no device measured positions.
+def registration_rows(data: Any, model: Any) -> Measurements | None:
+    """The rows of one set-up that say where the robot stands, with a hidden ball where a model has one.
 
-    Raises:
-        InputError: something else than rows. MeasurementError: rows of which a part says so.
+    None where no device measured positions. InputError for something else than rows.
     """
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
-    parts = rows_of_one_kind(data)
-    own = [sensor_of(part).set_up(part) for part, _ in parts]
-    if len(own) > 1 and any(rows is not None for rows in own):
-        fix = "recalibrate with them, which places every device; or pass the rows with measured positions alone "
-        fix += "(`data.device_rows()`), and the model will know their markers only"
-        got = ", ".join(part.kind for part, _ in parts)
-        raise MeasurementError.of("a registration", expected="rows of one kind", got=got, fix=fix)
-    return own[0]
+    own = [(sensor_of(part), sensor_of(part).set_up(part)) for part, _ in rows_of_one_kind(data)]
+    return next((sensor.with_points(rows, model) for sensor, rows in own if rows is not None), None)
 
 
 def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
@@ -176,7 +187,8 @@ def _starts(part: Known, widest: float) -> list[Place]:
     session, old, view, same = part
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
+    points = session.points[:, : session.points.shape[1] - session.ball]
+    shown = bool((~points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
     free = shown and session.frame_free and session.body_free
     if free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
         starts.append(anywhere(session, old))
@@ -278,7 +290,7 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         centre=R @ session.centre + mean.T[:3, 3],
         q=session.q,
         gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(widened * mean_block(session.noise, visible), R),
+        noise=turned(widened * _mean_noise(session, visible), R),
         free=free,
         outliers=outliers,
         rms_before=before,
@@ -288,6 +300,13 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
         undetermined=undetermined(covariance, mean.body.points, arm, usual, tips, rigid=rigid),
     )
+
+
+def _mean_noise(session: Session, visible: Tensor) -> Tensor:
+    """Covariance (m, m) of a new measurement, m^2: that of the fit for points that no row shows."""
+    found, unseen = mean_block(session.noise, visible), ~visible.any(0)
+    both = unseen[:, None] & unseen
+    return torch.where(both, session.fitted.new_noise, found) if bool(unseen.any()) else found
 
 
 def _rms(errors: Tensor) -> float:
@@ -319,3 +338,58 @@ def warn_about(found: Registration, *, outliers: bool = True, excess: bool = Tru
         what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))
+
+
+PRIOR_FREEDOM = 10.0
+"""The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
+FALSE_ALARM_PROBABILITY = 0.001
+"""Probability that clean rows have an outlier."""
+MOST_PAIRS = 800
+
+
+def worst_rows(found: Estimate) -> list[int]:
+    """The one or two rows that contradict all others, or none."""
+    M = len(found.rows.residual)
+    for size in (1, 2):
+        sets = list(combinations(range(M), size))
+        if M - size < 3 or len(sets) > MOST_PAIRS:
+            continue
+        numbers = torch.tensor(sets, dtype=torch.int64, device=found.T.device)
+        falls = _falls(found, numbers)
+        chances = _chances(found, falls, numbers)
+        best = int(np.lexsort((-falls.numpy(force=True), chances))[0])  # of equal chances the largest fall
+        if chances[best] * len(sets) < FALSE_ALARM_PROBABILITY:
+            return list(sets[best])
+    return []
+
+
+def scale(found: Estimate) -> float:
+    """Square of the residuals' scale in units of what model and noise lead to expect."""
+    return float(_scales(found, found.T.new_zeros(()), found.T.new_zeros(()))[0])
+
+
+def _scales(found: Estimate, without: Tensor, coordinates: Tensor) -> tuple[Tensor, Tensor]:
+    """The same without parts of the quadratic form that belong to so many coordinates, and degrees of freedom."""
+    freedom = (found.rows.visible.sum() - coordinates - found.determined).clamp(min=0.0) + PRIOR_FREEDOM
+    return ((found.quadratic - without).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
+
+
+def _falls(found: Estimate, sets: Tensor) -> Tensor:
+    """Fall of the quadratic form without each set of rows: (K, size) -> (K,)."""
+    m = found.rows.residual.shape[1]
+    S = found.rows.slopes.flatten(0, 1)[:, found.free]
+    mu = found.precision @ (found.rows.residual.flatten() - S @ found.mean)
+    places = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
+    blocks = found.precision[places[:, :, None], places[:, None, :]]
+    chosen = mu[places]
+    return (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
+
+
+def _chances(found: Estimate, falls: Tensor, sets: Tensor) -> np.ndarray:
+    """Probabilities (K,) of such falls by chance."""
+    from scipy.stats import f  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    coordinates = found.rows.visible.sum(1).to(falls)[sets].sum(1)
+    variances, freedom = _scales(found, falls, coordinates)
+    ratios = falls / coordinates / variances
+    return f.sf(*(values.numpy(force=True) for values in (ratios, coordinates, freedom)))

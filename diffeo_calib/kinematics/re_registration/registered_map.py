@@ -8,25 +8,47 @@ errors e of the model at these rows and from their noise, u = u' - A (e + noise)
 
 with S the derivatives by u, U the covariance of u, and C the posterior covariance of the fit. The last terms matter: a
 base that the fit left uncertain is found anew together with the frame.
+
+A fitted map seen from another place: T o k1 for a rigid transform T, as exact as k1 itself.
+
+If the task kernel is the same in all directions, K_W(R y, R y') = K_W(y, y'), rotating points and momenta of a geodesic
+rotates the geodesic. So T o psi o k0 is the map with
+
+    base <- T base,    p <- R p,    noise <- R noise R^T,
+
+R the rotation of T. The controls z0 = k0(xi) follow the base, and theta stays: its error twist of the base stands
+behind the base.
+
+Directions of base and markers that measurements hardly determine, in sentences.
+
+The place of the measuring frame is judged with the markers given: where both move together, the marker is what is not
+known, and turning the tool determines it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import degrees
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +115,7 @@ class RegisteredMap(FittedMap):
     """T o k1 of the markers of a registration.
 
     Args:
-        fitted: the fitted map, seen from the new measuring frame (:func:`diffeo_calib.kinematics.new_frame.moved`).
+        fitted: the fitted map, seen from the new measuring frame (:func:`moved`).
         registration: what was found.
 
     Raises:
@@ -160,6 +182,17 @@ class RegisteredMap(FittedMap):
         """That of the fit alone, without the registration's."""
         return self.fitted.covariance_between(at, other)
 
+    def joint_covariance(self, x: Tensor) -> Tensor:
+        """That of the registration included, see :meth:`FittedMap.joint_covariance`."""
+        points, at = self.geodesic.linearised_value(x)
+        at, found = (
+            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1)),
+            self.registration,
+        )
+        S = self.place_slopes(x)
+        cross = S @ (found.gain.to(S) @ self.fitted.covariance_between(self._rows, at))
+        return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT
+
     def _added(self, at: Linearisation, by_marker: Tensor | None) -> Tensor:
         """What the registration adds to the covariance: (M, m', m')."""
         found, device = self.registration, self.deformation.x.device
@@ -185,6 +218,13 @@ class RegisteredMap(FittedMap):
         shifts = variances[6:].view(-1, 3).sum(1) if with_markers else torch.zeros_like(turn)
         total = 0.75 * float(turn) ** 2 * squares + (turn * shifts).to(squares)
         return total.repeat_interleave(3, dim=1)
+
+    def place_slopes(self, q: Tensor) -> Tensor:
+        """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
+        rows = q.to(self.deformation.x.device)
+        points = self.geodesic(rows).detach().view(len(rows), -1, 3)
+        S = frame_slopes(points, self.registration.centre.to(points))
+        return torch.cat([S, marker_slopes(self.geodesic, self.points, rows)], -1).flatten(0, 1)
 
     @cached_property
     def _rows(self) -> Linearisation:
@@ -214,3 +254,151 @@ def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, q: Ten
     _, by_point = deformation.task_flow.with_jacobian(points(xi, theta).view(-1, 3))
     shifts = points.shifts(xi, theta)  # (N, 3 P, 3 P)
     return (by_point @ shifts.view(len(by_point), 3, -1)).view(shifts.shape)
+
+
+def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
+    """T o k1.
+
+    Args:
+        fitted: k1. nominal: its nominal map. T: (4, 4) rigid transform from the old to the new measuring frame, m.
+
+    Raises:
+        InputError: the map is not exact, or its task kernel is not the same in all directions.
+    """
+    old = fitted.geodesic
+    check_isotropic(old.spec.task_kernel)
+    device = old.x.device
+    geometry = nominal.geometry
+    base = T.to(geometry.base.device) @ geometry.base
+    base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
+    after = nominal.with_geometry(replace(geometry, base=base))
+    by_row: Any = old.spec.at_controls
+    by_row = by_row if by_row is None else by_row.around(after)
+    spec = replace(old.spec, nominal=after, at_controls=by_row)
+    R = T[:3, :3].to(device)
+    b, p, theta = old.momenta.tensors
+    deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
+    parts = fitted.data, turned(fitted.new_noise, R), fitted.workspace
+    if fitted.slopes is not None:  # what was measured has no direction of its own
+        each = torch.block_diag(*[R] * (fitted.m // 3))
+        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y)
+    noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
+    y = None if fitted.y is None else (fitted.y.unflatten(1, (-1, 3)) @ R.mT + T[:3, 3].to(device)).flatten(1)
+    return FittedMap(deformation, noise, *parts, y=y)
+
+
+def turned_points(displacements: Tensor, R: Tensor) -> Tensor:
+    """Turned displacements of points: (N, 3 P, c), (3, 3) -> (N, 3 P, c)."""
+    return (R @ displacements.unflatten(1, (-1, 3))).flatten(1, 2)
+
+
+def turned(covariance: Tensor, R: Tensor) -> Tensor:
+    """The covariance of turned points: (..., 3 P, 3 P), (3, 3) -> (..., 3 P, 3 P), symmetric to the last bit."""
+    each = torch.block_diag(*[R] * (covariance.shape[-1] // 3))
+    after = each @ covariance @ each.mT
+    return 0.5 * (after + after.mT)
+
+
+def check_isotropic(kernel: Kernel) -> None:
+    """Raise InputError unless a kernel on R^3 is the same in all directions."""
+    for term in kernel.terms:
+        if not (isinstance(term, RadialKernel) and _isotropic(term)):
+            what = f"the task kernel of this model ({term!r}) is not the same in all directions"
+            fix = "fit again in the new frame, or with a task kernel of one length scale and one variance"
+            raise InputError.of(f"{what}: the model cannot be moved to another frame", fix=fix)
+
+
+def _isotropic(kernel: RadialKernel) -> bool:
+    periodic = kernel.periodic if isinstance(kernel.periodic, bool) else any(kernel.periodic)
+    scales = (kernel.lengthscale, kernel.variance)
+    same = all(bool((scale == scale.flatten()[0]).all()) for scale in scales)
+    return same and not periodic and kernel.columns is None and kernel.output is None
+
+
+WELL_KNOWN_M = 1e-4
+"""Smaller deviations are never named, whatever the noise."""
+HARDLY = 10.0
+"""A direction is hardly determined if its deviation is so many times that of a predicted row."""
+SPREAD, TURN = "spread the poses over the workspace", "turn the tool about several axes between the poses"
+
+
+def undetermined(
+    covariance: Tensor, markers: Tensor, arm: float, usual: float, tips: Sequence[str], *, rigid: bool
+) -> tuple[str, ...]:
+    """Sentences about the directions of frame and markers whose deviations are large.
+
+    Args:
+        covariance: (6 + 3 P, 6 + 3 P) of shift and turn of the measuring frame about the middle of the rows, then of
+            the markers in the tip's frame, m and rad.
+        markers: (P, 3) in the tip's frame, m.
+        arm: distance from the middle of the rows at which a turn of the frame matters, m.
+        usual: deviation of a coordinate of a predicted row, m. tips: names of those of the markers.
+        rigid: whether the markers are the points of measured frames, three of each.
+    """
+    limit = max(HARDLY * usual, WELL_KNOWN_M)
+    together = covariance[:6, 6:]
+    frame = covariance[:6, :6] - together @ torch.linalg.pinv(covariance[6:, 6:], hermitian=True) @ together.mT
+    found = [
+        _sentence("the place of the measuring frame", frame[:3, :3], limit, "mm", SPREAD),
+        _sentence("the turn of the measuring frame", frame[3:, 3:], limit / max(arm, usual), "degrees", SPREAD),
+        *(_frame_on_tip if rigid else _markers_on_tip)(covariance[6:, 6:], markers, limit, tips),
+    ]
+    return tuple(text for text in found if text)
+
+
+def _markers_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
+    """About each of the markers."""
+    places = covariance.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (P, 3, 3)
+    names = [f"marker {k}" for k in range(len(markers))] if len(markers) > 1 else ["the marker"]
+    named = zip(names, tips, places, strict=True)
+    return [_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", TURN) for name, tip, place in named]
+
+
+def _frame_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
+    """About each of the frames that three points represent."""
+    blocks = own_blocks(covariance[None], len(markers) // POINTS)[0]
+    each = zip(blocks, markers.split(POINTS), tips[::POINTS], strict=True)
+    return [text for one in each for text in _about_frame(*one, limit)]
+
+
+def _about_frame(covariance: Tensor, markers: Tensor, tip: str, limit: float) -> list[str]:
+    """About one frame, covariance (9, 9) and points (3, 3)."""
+    arms = markers - markers.mean(0)
+    eye = torch.eye(3, dtype=markers.dtype, device=markers.device).expand(len(arms), 3, 3)
+    motion = torch.linalg.pinv(torch.cat([eye, -skew(arms)], 2).flatten(0, 1))  # (6, 3 P)
+    frame = motion @ covariance @ motion.mT
+    lever = float(arms.square().sum(1).mean().sqrt())
+    return [
+        _sentence(f"the place of the measured frame on '{tip}'", frame[:3, :3], limit, "mm", TURN),
+        _sentence(f"the turn of the measured frame on '{tip}'", frame[3:, 3:], limit / lever, "degrees", TURN),
+    ]
+
+
+def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) -> str:
+    """A sentence about the directions with large deviations; empty if there are none."""
+    large = _large(covariance, limit)
+    if not large:
+        return ""
+    to = ", ".join(_number(degrees(s) if unit == "degrees" else 1e3 * s) for s, _ in large)
+    along = ", ".join(_direction(v) for _, v in large)
+    if len(large) == len(covariance):
+        return f"{what} is known to {to} {unit} only: {fix}"
+    return f"{what} {'about' if unit == 'degrees' else 'along'} {along} is known to {to} {unit} only: {fix}"
+
+
+def _large(covariance: Tensor, limit: float) -> list[tuple[float, Tensor]]:
+    """Deviations above the limit, and their directions, the largest first."""
+    values, vectors = torch.linalg.eigh(covariance)
+    deviations = values.clamp(min=0).sqrt()
+    return [(float(s), v) for s, v in zip(deviations.flip(0), vectors.mT.flip(0), strict=True) if float(s) > limit]
+
+
+def _number(value: float) -> str:
+    """Two digits."""
+    return f"{value:.2g}" if value < 99.5 else f"{round(value, -1):.0f}"
+
+
+def _direction(vector: Tensor) -> str:
+    """A unit vector, its largest component positive."""
+    signed = vector * vector[vector.abs().argmax()].sign()
+    return "(" + ", ".join(f"{value + 0.0:.2f}" for value in signed.tolist()) + ")"

@@ -10,15 +10,14 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.new_frame import turned
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, turned
 from diffeo_calib.maps.noise import without_hidden
+from diffeo_calib.measurements.bodies import Body, bodies_of
 from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.sensors.bodies import Body, bodies_of
 
 LEAST_POINTS = 3
 """Points that determine where a frame is."""
@@ -37,8 +36,10 @@ class Known(NamedTuple):
         return self._replace(session=self.session.rows(keep), view=self.view.rows(keep))
 
 
-def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str) -> Known:
-    """The rows as the fitted map sees them, in its own frame.
+def session_of(
+    model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool = False
+) -> Known:
+    """The rows as the fitted map sees them, in its own frame; ``ball``: see :class:`Session`.
 
     Raises:
         InputError: the markers are to stay, but other ones were measured.
@@ -46,7 +47,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     """
     before, fit = model.registration, model.unregistered
     markers = _markers(fit, nominal) if before is None else before.markers
-    own, seen = bodies_of(lever), bodies_of(data.lever)
+    own, seen = bodies_of(lever), data.bodies
     known = own.kind == seen.kind and data.markers == len(markers)
     if known:
         data, seen = own.represented(data), own
@@ -60,7 +61,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
     zero = data.points.new_zeros(size, size)
     rows = data.q, data.points, _noise(model.new_noise, data, None), zero[0, :3], zero
-    session = Session(fit, nominal, same, *rows, free != "marker", free != "base")
+    session = Session(fit, nominal, same, *rows, free != "marker", free != "base", ball)
     view = session.view(old)
     T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
     earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
@@ -111,7 +112,7 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    each = bodies_of(data.lever).numbers * float(data.seen_bodies.sum()) / len(data)
+    each = data.bodies.numbers * float(data.seen_bodies.sum()) / len(data)
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import TextCells
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, position_triples

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
-from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
 from diffeo_calib.measurements.csv.images import image_sheet
@@ -28,8 +28,8 @@ from diffeo_calib.measurements.table_format import Names, TableFormat, flat_name
 
 Cells = Sequence[Sequence[float | str]]
 """Rows of cells: numbers and texts."""
-Predictions = tuple[Tensor, Tensor, Tensor]
-"""Configurations (B, n) [rad or m], predicted points or poses, and their standard deviations."""
+Predictions = tuple[Tensor, ...]
+"""Configurations (B, n) [rad or m], predicted points or poses, standard deviations, and perhaps more cells (B, k)."""
 
 
 def write_predictions(
@@ -40,18 +40,20 @@ def write_predictions(
     joints: Sequence[str],
     kinds: Sequence[str] | None = None,
     prefixes: Sequence[str] = ("",),
+    more: Sequence[str] = (),
 ) -> None:
     """Write configurations, predicted markers and their standard deviations; overwrites.
 
-    Columns: the joints, then x, y, z, std_x, std_y, std_z for each marker; of several markers with prefixes.
+    Columns: the joints, then x, y, z, std_x, std_y, std_z for each marker; of several markers with prefixes; then more.
 
     Args:
         path: the file; it appears when the last block is written.
-        blocks: configurations (B, n), rad and m, markers (B, P, 3), m, and their standard deviations (B, P, 3), m.
+        blocks: configurations (B, n), rad and m, markers (B, P, 3), m, their standard deviations (B, P, 3), m, and more
+            cells (B, k) as they are written.
         table: units, separator and decimal mark.
         joints: names of the joint columns.
         kinds: kind of every joint; all revolute by default.
-        prefixes: what the names of the columns of each marker begin with.
+        prefixes: what the names of the columns of each marker begin with. more: k names of further columns.
 
     Raises:
         InputError: a file that cannot be written.
@@ -59,11 +61,11 @@ def write_predictions(
     columns = Columns.of(table.joints_only(), joints, kinds, [])
     names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
 
-    def rows(q: Tensor, points: Tensor, deviations: Tensor) -> Tensor:
+    def rows(q: Tensor, points: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
         lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
-        return torch.cat([columns.joints_from_si(q), lengths], dim=1)
+        return torch.cat([columns.joints_from_si(q), lengths, *others], dim=1)
 
-    write_rows(path, [*columns.joints, *names], (rows(*block) for block in blocks), table)
+    write_rows(path, [*columns.joints, *names, *more], (rows(*block) for block in blocks), table)
 
 
 def write_pose_predictions(
@@ -74,6 +76,7 @@ def write_pose_predictions(
     joints: Sequence[str],
     kinds: Sequence[str] | None = None,
     prefixes: Sequence[str] = ("",),
+    more: Sequence[str] = (),
 ) -> None:
     """Write configurations, predicted poses and their standard deviations; overwrites.
 
@@ -83,11 +86,11 @@ def write_pose_predictions(
     Args:
         path: the file; it appears when the last block is written.
         blocks: configurations (B, n), rad and m, poses (B, 4, 4) or (B, T, 4, 4), m, and standard deviations (B, 6) or
-            (B, T, 6): of positions, m, and of rotations about the measuring frame's axes, rad.
+            (B, T, 6): of positions, m, and of rotations about the measuring frame's axes, rad; and more cells (B, k).
         table: the format, with defaults as in :func:`write_measurements`.
         joints: names of the joint columns.
         kinds: kind of every joint; all revolute by default.
-        prefixes: what the names of the columns of each frame begin with.
+        prefixes: what the names of the columns of each frame begin with. more: k names of further columns.
 
     Raises:
         MeasurementError: unknown unit or convention.
@@ -101,14 +104,14 @@ def write_pose_predictions(
     for prefix, turn, deviation in zip(prefixes, turns, deviations, strict=True):
         names += [*(f"{prefix}{name}" for name in lengths), *turn, *deviation]
 
-    def rows(q: Tensor, poses: Tensor, deviations: Tensor) -> Tensor:
+    def rows(q: Tensor, poses: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
         parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), -1, 6)
         for pose, own in zip(by_frame(poses).unbind(1), spreads.unbind(1), strict=True):
             parts.append(columns.lengths_from_si(torch.cat([pose[:, :3, 3], own[:, :3]], dim=1)))
             parts += rotation_parts(pose[:, None], own[:, 3:], table)
-        return torch.cat(parts, dim=1)
+        return torch.cat([*parts, *others], dim=1)
 
-    write_rows(path, names, (rows(*block) for block in blocks), table)
+    write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
 
 def _per_frame(names: Sequence[str], count: int) -> list[Sequence[str]]:

@@ -26,7 +26,6 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -101,7 +100,7 @@ class Findings:
         """RMS distance, m, below which no model of the positions can come: repeatability, or the noise of the fit."""
         if self.repeats is not None and self.repeats.telling:
             return self.repeats.deviation
-        return body_kind(self.model.lever).noise_rms(self.model.map.new_noise)
+        return self.model.bodies.noise_rms(self.model.map.new_noise)
 
 
 def find(
@@ -235,7 +234,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     large = predictions.errors.median > CALM * float(predictions.claimed.nanmedian())
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
-    if data.body_kind.perhaps_moved(far=large):
+    if data.bodies.perhaps_moved(far=large):
         named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from diffeo_calib.calibration import expected_errors as workspace
+from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.result import Progress, silent
@@ -23,7 +23,7 @@ from diffeo_calib.reports.analysis.stages import (
     configurations,
     placed_stages,
 )
-from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 
 STEPS = 2
@@ -50,13 +50,29 @@ class KindFindings:
     deviations: Deviations
     parts: Sequence[Part]
 
-    rms_of = "expected of positions over the joint ranges of the fit"
+    @property
+    def judged(self) -> tuple[float, str]:
+        """The RMS error, m, that is compared with a tolerance, and of what it is.
+
+        Positions that the model has not seen decide. A spread or an error of readings is no accuracy, but the model is
+        not more accurate than these.
+        """
+        own = [list(stages.values())[-1] for stages in self.kinds.values()] if self.new else []
+        found = [(one.rms, f"of these rows ({one.label})") for one in own if one.unit == "m"]
+        if not any(one.what == ERRORS for one in own):
+            expected = self.deviations.error.whole
+            found.append((expected, "expected of positions over the joint ranges of the fit"))
+        return max(found)
 
     @property
     def rms(self) -> float:
-        """RMS error of positions that the model expects of itself, m."""
-        *_, own = self.expected.values()
-        return own
+        """See :attr:`judged`."""
+        return self.judged[0]
+
+    @property
+    def rms_of(self) -> str:
+        """What it is of, in words."""
+        return self.judged[1]
 
     @property
     def count(self) -> int:
@@ -66,7 +82,8 @@ class KindFindings:
 
 def of_positions_alone(model: CalibratedKinematics, data: Any) -> bool:
     """Whether a device measured a position, or pose, of every marker of the model in all rows."""
-    return not model.ball and (data is None or {part.kind for part in data.parts} <= {"position", "pose"})
+    others = model.ball or model.map.unregistered.slopes is not None
+    return not others and (data is None or {part.kind for part in data.parts} <= {"position", "pose"})
 
 
 def find_kinds(
@@ -101,8 +118,9 @@ def find_kinds(
     progress("analysis", 1, STEPS)
     fitted, q = model.configurations.to(HOST), configurations(model, CONFIGURATIONS, 0)
     some = fitted[:: -(-len(fitted) // MEASURED)]
-    deviations = Deviations(q, claimed(model, q), some, claimed(model, some))
-    expected = workspace.expected_errors(model, stages)
+    error = ExpectedError.of(model)
+    deviations = Deviations(q, claimed(model, q), some, claimed(model, some), error)
+    expected = expected_errors(model, stages, error)
     progress("analysis", STEPS, STEPS)
     return KindFindings(model, kinds, new, devices, expected, deviations, parts(model))
 

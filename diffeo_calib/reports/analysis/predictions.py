@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.sensors.coordinates import sensor_of
@@ -46,9 +45,8 @@ class Predictions:
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
         sensor_of(data).check(data, model)
-        points, predicted, covariance = body_kind(data.lever).shown(model.at_payloads(data.payload), data.q)
-        found = _errors(points, data)
-        return cls(data, data.origins, predicted, covariance, found, left_out=False)
+        seen = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+        return cls(data, data.origins, seen.origins, seen.places, _errors(seen.points, data), left_out=False)
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
@@ -56,7 +54,7 @@ class Predictions:
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = _errors(points, data)
-        predicted, covariance = data.body_kind.claimed(points, covariance, rows.predicted)
+        predicted, covariance = data.bodies.claimed(points, covariance, rows.predicted)
         return cls(data, data.origins, predicted, covariance, found, left_out=True)
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
@@ -114,4 +114,4 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
 
 def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
     """Predicted positions of the markers, or of the origins of measured poses: (N, B, 3) m."""
-    return data.body_kind.origins(at_payloads(kinematics, data)(data.q).detach())
+    return data.bodies.origins(at_payloads(kinematics, data)(data.q).detach())

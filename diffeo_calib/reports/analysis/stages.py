@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.robust_registration import register_robustly
+from diffeo_calib.calibration.identification.registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
-from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.sensors.errors import Evaluation
@@ -69,22 +69,24 @@ class Deviations:
         q: (M, n) random configurations in these ranges, rad or m.
         deviation: (M,) RMS distance of the markers that the model claims there, m.
         measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
+        error: what the model expects in all, as every command says it.
     """
 
     q: Tensor
     deviation: Tensor
     measured: Tensor
     measured_deviation: Tensor
+    error: ExpectedError
 
     @property
     def rms(self) -> float:
-        """RMS of the deviations anywhere in the ranges, m."""
-        return float(self.deviation.square().mean().sqrt())
+        """RMS error expected anywhere in the ranges, m, apart from what the rows leave open."""
+        return self.error.workspace
 
     @property
     def measured_rms(self) -> float:
-        """RMS of the deviations at configurations of the fit, m."""
-        return float(self.measured_deviation.square().mean().sqrt())
+        """RMS error expected at configurations of the fit, m."""
+        return self.error.measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +103,13 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
     fitted = fitted[:: -(-len(fitted) // MEASURED)]
     found = plan(model, q, NEXT, target=q[:TARGETS])
     deviation = found.known_rms if model.registration is None else claimed(model, q)
-    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), found)
+    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), ExpectedError.of(model), found)
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
     q = q.to(model.configurations.device)
-    _, _, covariance = body_kind(model.lever).shown(model, q, noise=False)
+    covariance = model.bodies.predicted(model, q, noise=False).places
     return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
 
 

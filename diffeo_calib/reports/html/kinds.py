@@ -27,7 +27,7 @@ FLATTERING = {
 def rows_of(found: KindFindings) -> str:
     """What the errors are of, in words."""
     if not found.kinds:
-        return "no rows were passed"
+        return "none, because no rows were passed"
     return f"{found.count} rows that the model has not seen" if found.new else f"{found.count} rows of its own fit"
 
 
@@ -98,6 +98,7 @@ def _how_good(found: KindFindings) -> Section:
     present = {next(iter(stages.values())).what for stages in found.kinds.values()}
     notes = [text for what, text in FLATTERING.items() if what in present]
     see = f"Errors on {rows_of(found)}, each kind in its own unit; units are never mixed."
+    see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
     return Section("errors", "How good", see, [_table(own) for own in found.kinds.values()], None, pictures, notes)
 
 
@@ -122,6 +123,7 @@ def _expected(found: KindFindings) -> Section:
         for joint, name in enumerate(robot.joint_names)
     ]  # fmt: skip
     see = "RMS errors of positions that the model itself expects over the joint ranges of its rows"
-    see += ", after a rigid fit, because no device says where the robot stands." * free + "." * (not free)
+    see += ", after a rigid fit, because no device says where the robot stands" * free
+    see += f": {printable(found.deviations.error.sentence)}."
     table = Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)
     return Section("expected", "What to expect", see, [table], None, pictures)

@@ -9,12 +9,11 @@ import torch
 
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
-from diffeo_calib.kinematics.model_views import measured_words
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
-from diffeo_calib.measurements.body_kinds import body_kind, matrix_lines
+from diffeo_calib.measurements.bodies import matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
@@ -133,7 +132,7 @@ def where(found: Findings) -> Section:
     see = (
         "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
         f"model itself expects, without the noise of a measurement: {rough_millimetres(expected.measured_rms)} mm RMS "
-        f"at the measured configurations, {rough_millimetres(expected.rms)} mm anywhere in the measured joint ranges."
+        f"at the measured configurations; anywhere in the measured joint ranges {printable(expected.error.sentence)}."
     )
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     then = rough_millimetres(float(expected.next.expected_rms[-1]))
@@ -150,7 +149,7 @@ def _scene(found: Findings) -> Scene:
     step, errors = -(-int(there.sum()) // MOST_POINTS), {}
     *before, (last, _) = found.stages.items()
     for name, kinematics in before:
-        predicted = seen.data.body_kind.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
+        predicted = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
         errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)
     errors[last] = listed(seen.away[there][::step], DIGITS + 2)
     return Scene(listed(seen.measured[there][::step], DIGITS), errors)
@@ -387,4 +386,4 @@ def _places(model: CalibratedKinematics) -> Iterator[str]:
     """Where the base and the markers, or the measured frame, were found."""
     yield "robot base in the measuring frame, 4 x 4 [m]:"
     yield from matrix_lines(model.geometry.base)
-    yield from body_kind(model.lever).place_lines(model)
+    yield from model.bodies.place_lines(model)

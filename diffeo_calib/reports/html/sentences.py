@@ -8,8 +8,7 @@ import torch
 
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
-from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.measurements.body_kinds import body_kind
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
@@ -84,7 +83,7 @@ def advice(found: Findings) -> Iterator[str]:
 
 def _unless_planned(found: Findings) -> str:
     """That planned poses help where more of the same do not, if they do."""
-    now, then = found.expected.rms, float(found.expected.next.expected_rms[-1])
+    now, then = (float(found.expected.next.expected_rms[count]) for count in (0, -1))
     if now < ENOUGH * then:
         return ""
     lower = f"from {rough_millimetres(now)} to {rough_millimetres(then)} mm"
@@ -94,7 +93,7 @@ def _unless_planned(found: Findings) -> str:
 def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
     expected, model = found.expected, found.model
-    if expected.rms < FAR_RATIO * expected.measured_rms:
+    if expected.error.whole < FAR_RATIO * expected.measured_rms:
         return
     tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
@@ -102,10 +101,10 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     variances = found.rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
     deviation, place = variances.sqrt().max(0)
     number, axis = divmod(int(place), 3)
-    far = rough_millimetres(expected.rms)
+    far = rough_millimetres(expected.error.whole)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
     if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
-        what = body_kind(model.lever).name(number, len(found.rows.on))
+        what = model.bodies.name(number, len(found.rows.on))
         known = f"{rough_millimetres(float(deviation))} mm along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
             f"{far}, because {what} and base can hardly be told apart (the {what} is known to {known}). To change "

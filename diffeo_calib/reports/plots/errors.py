@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -110,7 +110,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
     """
     rows = FitRows(model)
     seen = Predictions.of_fit(rows) if data is None else Predictions.of(model, data)
-    geometric = seen.data.body_kind.origins(stages_of(model)[GEOMETRIC](seen.data.q))
+    geometric = seen.data.bodies.origins(stages_of(model)[GEOMETRIC](seen.data.q))
     there = ~seen.measured.isnan().any(2)  # of the sightings
     places, before, after = seen.measured[there], (seen.measured - geometric)[there], seen.away[there]
     figure = Figure(figsize=(9.6, 4.8), layout="constrained")

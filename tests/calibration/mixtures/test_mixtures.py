@@ -17,11 +17,10 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
-from diffeo_calib.calibration.scales.defaults import defaults
-from diffeo_calib.calibration.scales.selection import log_posterior
+from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import region_factor
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.rows import with_attributes
@@ -260,16 +259,10 @@ def test_what_needs_measured_positions_alone(
     poses = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
     posed = dc.Measurements.from_poses(tracked.q[:6], poses, tracked.joint_names, doubt=False)
     assert isinstance(dc.Measurements.joined([posed, resting]), dc.Observations)
-    with pytest.raises(InputError, match=r"recalibrate with them.*data.device_rows\(\)"):
-        result.model.registered(mixture)
     with pytest.raises(MeasurementError, match="the rows have no sockets"):
         tracked.socket_rows()
     new = tracked.rows(slice(TRACKED, None))
     seen = result.model.registered(new.rows(slice(8)))
     assert dc.evaluate(seen, new.rows(slice(8, None))).rms < 3e-4
-    assert not seen.ball
-    for data in (None, new.rows(slice(8))):
-        with pytest.raises(InputError, match=r"the rows of the fit: .* registered with 1 marker\(s\), fitted with 2"):
-            dc.write_report(seen, tmp_path / "page.html", data)
-    with pytest.raises(InputError, match=r"the first model: .* registered with 1 marker\(s\), fitted with 2; pass the"):
-        dc.compare(seen, seen)
+    assert seen.ball  # it stayed on the tool
+    dc.write_report(seen, tmp_path / "page.html", new.rows(slice(8)))

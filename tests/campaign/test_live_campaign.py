@@ -188,10 +188,10 @@ def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["sessions", "mixture", "several kinds", "payloads"])
 def test_other_kinds_of_rows(name: str) -> None:
-    """The rows of the bank in random order, as many as for two models."""
+    """The rows of the bank in random order, enough to place every device and for two models."""
     kind = kind_named(name)
     rows = joined_tables([kind.data, kind.new])
-    order = torch.randperm(len(rows), generator=torch.Generator("cpu").manual_seed(0))[:30]
+    order = torch.randperm(len(rows), generator=torch.Generator("cpu").manual_seed(0))
     campaign = dc.Campaign(kind.robot, candidates=kind.q(20), target=kind.q(10))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

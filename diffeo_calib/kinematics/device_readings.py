@@ -1,0 +1,138 @@
+"""What devices in known places will report: readings of the ball of a calibrated model, with their covariances.
+
+A reading at q is h(z(q), d), z the ball and d what is known of the device, both found from the same rows. Their errors
+belong together: whatever no row tells apart, such as the place of the whole scene, moves both and no reading. With
+slopes A by the points and B by the unknowns u of the device,
+
+    cov = A C A^T + A X B^T + B X^T A^T + B U B^T + noise,    X = cov(z, u), U = cov(u),
+
+from the posterior of the fit. Devices that measured no row of the fit were placed around the model: X = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.observation import Observation
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.places import PlacedDevices
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedReadings:
+    """What one device will report at N configurations.
+
+    Args:
+        kind: of its readings. device: its name. unit: of the readings.
+        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these.
+    """
+
+    kind: str
+    device: str
+    unit: str
+    mean: Tensor
+    covariance: Tensor
+
+    @property
+    def deviations(self) -> Tensor:
+        """(N, r) standard deviations."""
+        return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
+
+
+class _Seen(NamedTuple):
+    """The points of a model at some configurations: values (N, 3 P), m, and their linearisation."""
+
+    points: Tensor
+    at: Linearisation
+    sensitivity: Tensor | None
+
+
+class _Device(NamedTuple):
+    """One of a set of devices.
+
+    Args:
+        devices, number: the set, and its number there. deviations: (k,) of its unknowns: by the prior of the fit if it
+            measured rows of the fit, else by the rows on which it was placed.
+        columns: (c,) boolean, its unknowns among the shifts of the fit. noise: (r, r) of a reading, m^2. Both None for
+            a device that measured no row of the fit.
+    """
+
+    devices: Devices
+    number: int
+    deviations: Tensor
+    columns: Tensor | None = None
+    noise: Tensor | None = None
+
+    @classmethod
+    def of(cls, fitted: FittedMap, own: PlacedDevices, devices: Devices, number: int) -> _Device:
+        """By its rows in the fit, unless the model was moved since."""
+        rows, placed = own.rows[own.device == number], cls(devices, number, own.deviations[number])
+        if not len(rows) or fitted.registration is not None or fitted.slopes is None:
+            return placed
+        numbers = fitted.noise.visible[rows][0]
+        effects = fitted.noise.shared[rows][:, numbers]  # (M, r, c)
+        columns = (effects != 0).any(1).any(0)
+        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3 * devices.seen_points :])
+        if int(columns.sum()) != slopes.shape[2]:
+            return placed
+        deviations = (effects[..., columns].square().sum((0, 1)) / slopes.square().sum((0, 1))).sqrt()
+        noise = fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
+        return cls(devices, number, deviations, columns, noise)
+
+    def observation(self, rows: int) -> Observation:
+        """What so many rows of it observe, m."""
+        return self.devices.observation(torch.full((rows,), self.number, dtype=torch.int64, device=HOST))
+
+    def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
+        """Mean (N, r) and covariance (N, r, r) of its readings, m."""
+        width, observation = 3 * self.devices.seen_points, self.observation(len(seen.points))
+        points = seen.points[:, -width:]
+        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - width, 0))
+        B = observation.by_constants(points) * self.deviations
+        if self.columns is None:
+            covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
+        else:
+            covariance = fitted.with_shifts(seen.at.projected(A), B, self.columns)
+        if seen.sensitivity is not None:
+            moved = A @ (seen.sensitivity @ fitted.open_directions)
+            covariance = covariance + moved @ moved.mT
+        if noise:
+            covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
+        return observation.value(points), covariance
+
+
+def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
+    """What every device that a model knows will report of the ball; nothing for devices that measure coordinates.
+
+    Args:
+        model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
+    """
+    fitted: FittedMap = model.map
+    sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
+    if not sets:
+        return []
+    seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in range(0, len(q), PREDICT_ROWS)]
+    found = []
+    for own, devices in sets:
+        unit, scale, zero = own.shown_as
+        for number, name in enumerate(own.names):
+            device = _Device.of(fitted, own, devices, number)
+            means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)
+            factor = q.new_tensor(scale) / devices.metres[number]
+            mean = torch.cat(means) * factor + q.new_tensor(zero)
+            covariance = torch.cat(blocks) * factor[:, None] * factor
+            found.append(PredictedReadings(own.kind, name, unit, mean, covariance))
+    return found
+
+
+def _seen(fitted: FittedMap, q: Tensor, some: slice) -> _Seen:
+    geodesic = fitted.geodesic.at_rows(some)
+    points, at = geodesic.linearised_value(q[some])
+    return _Seen(points.detach(), at, fitted.open_sensitivity(geodesic.spec.nominal, q[some]))

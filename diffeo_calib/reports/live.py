@@ -1,0 +1,150 @@
+"""A page that shows a campaign while it runs, served to this machine alone.
+
+The page is one file without outside resources (html/live.html). What it shows comes as server-sent events. Each of them
+holds everything, so that a page that was reloaded or slept misses nothing. Decisions about rows come back by POST.
+
+Other machines connect only to an address that was asked for, with a token. Without one the Host header must name this
+machine, so that no page of another origin reaches the server under a name of its own; and a POST needs a header that
+browsers send across origins only after asking.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from queue import SimpleQueue
+from threading import Condition, Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from diffeo_calib.common.errors import InputError
+
+LOCAL = ("127.0.0.1", "localhost")
+ALIVE_SECONDS = 10.0
+"""After this long without news a page is told that the campaign is alive; closed ones are noticed then."""
+HEADER = "X-Campaign"
+
+
+class Page:
+    """A running server.
+
+    Attributes:
+        url: where the page is, with its token if it has one.
+        decisions: (row, whether it is accepted), as the buttons were pressed.
+    """
+
+    def __init__(self, server: ThreadingHTTPServer, token: str) -> None:
+        host, port = str(server.server_address[0]), server.server_address[1]
+        self.token, self.url = token, f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+        self.decisions: SimpleQueue[tuple[int, bool]] = SimpleQueue()
+        self._news, self._state, self._count, self.closed = Condition(), "{}", 0, False
+
+    def publish(self, state: dict[str, Any]) -> None:
+        """Show something new on all pages."""
+        with self._news:
+            self._state, self._count = json.dumps(state), self._count + 1
+            self._news.notify_all()
+
+    def close(self) -> None:
+        """Let all pages go."""
+        with self._news:
+            self.closed = True
+            self._news.notify_all()
+
+    def states(self) -> Iterator[str]:
+        """What to show, from now on; empty texts in between."""
+        seen = -1
+        while True:
+            with self._news:
+                if not self.closed and self._count == seen:
+                    self._news.wait(ALIVE_SECONDS)
+                if self.closed:
+                    return
+                text, seen = "" if self._count == seen else self._state, self._count
+            yield text
+
+
+@contextmanager
+def served(address: str) -> Iterator[Page]:
+    """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
+
+    Raises:
+        InputError: no such address, or one that is taken.
+    """
+    host, _, port = address.rpartition(":")
+    host = host or LOCAL[0]
+    try:
+        server = ThreadingHTTPServer((host, int(port)), _Handler)
+    except (OSError, ValueError, OverflowError) as error:
+        expected = "a free port, or HOST:PORT"
+        raise InputError.of(f"the page at {address}", expected=expected, got=str(error)) from error
+    server.daemon_threads = True
+    page = Page(server, "" if host in LOCAL else secrets.token_urlsafe())
+    vars(server)["page"] = page
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield page
+    finally:
+        page.close()
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers the page's requests."""
+
+    @property
+    def page(self) -> Page:
+        return vars(self.server)["page"]
+
+    def do_GET(self) -> None:
+        """The page, or its events."""
+        path = urlsplit(self.path).path
+        if not self._allowed():
+            self.send_error(403)
+        elif path == "/":
+            self._begin("text/html; charset=utf-8")
+            self.wfile.write(files("diffeo_calib.reports.html").joinpath("live.html").read_bytes())
+        elif path == "/events":
+            self._begin("text/event-stream")
+            with suppress(OSError):  # the page was closed
+                for text in self.page.states():
+                    self.wfile.write(f"data: {text}\n\n".encode() if text else b": alive\n\n")
+                    self.wfile.flush()
+        else:
+            self.send_error(404)
+
+    def do_POST(self) -> None:
+        """A decision: /accept?row=N or /reject?row=N."""
+        parts = urlsplit(self.path)
+        row = parse_qs(parts.query).get("row", [""])[0]
+        if not self._allowed() or self.headers.get(HEADER) is None:
+            self.send_error(403)
+        elif parts.path not in ("/accept", "/reject") or not row.isdecimal():
+            self.send_error(404)
+        else:
+            self.page.decisions.put((int(row), parts.path == "/accept"))
+            self._begin("text/plain")
+
+    def log_message(self, *_: object) -> None:
+        """Nothing is printed."""
+
+    def _begin(self, kind: str) -> None:
+        self.send_response(200)
+        headers = {"Content-Type": kind, "Cache-Control": "no-store", "Referrer-Policy": "no-referrer"}
+        headers["Content-Security-Policy"] = "default-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def _allowed(self) -> bool:
+        if self.page.token:
+            given = parse_qs(urlsplit(self.path).query).get("token", [""])[0]
+            return secrets.compare_digest(given.encode(), self.page.token.encode())
+        return self.headers.get("Host", "").rpartition(":")[0] in LOCAL

@@ -1,0 +1,139 @@
+"""The page of a campaign: who may see it, what comes when, and in a real browser what is drawn and what buttons do."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import torch
+
+import diffeo_calib as dc
+from diffeo_calib.cli.commands.campaign import state_of
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.reports.live import Page, served
+from diffeo_calib.robots import SimulatedArm
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+ARM = SimulatedArm(3)
+
+
+def answer(page: Page, method: str, path: str, **headers: str) -> int:
+    parts = urlsplit(page.url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10)
+    connection.request(method, path, headers=headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    with served("0") as running:
+        yield running
+
+
+def test_only_this_machine_under_its_own_name(page: Page) -> None:
+    assert page.url.startswith("http://127.0.0.1:")
+    assert answer(page, "GET", "/") == 200
+    assert answer(page, "GET", "/", Host="evil.example:80") == 403
+    assert answer(page, "GET", "/../journal") == 404
+    mine = {"X-Campaign": "1"}
+    assert answer(page, "POST", "/reject?row=3") == 403
+    assert answer(page, "POST", "/reject?row=3", Host="evil.example", **mine) == 403
+    assert answer(page, "POST", "/reject?row=x", **mine) == 404
+    assert page.decisions.empty()
+    assert answer(page, "POST", "/reject?row=3", **mine) == 200
+    assert answer(page, "POST", "/accept?row=4", **mine) == 200
+    assert [page.decisions.get(), page.decisions.get()] == [(3, False), (4, True)]
+
+
+def test_another_address_needs_the_token() -> None:
+    with served("0.0.0.0:0") as page:
+        assert answer(page, "GET", "/") == answer(page, "GET", "/?token=wrong") == 403
+        assert answer(page, "GET", "/events?token=") == 403
+        assert answer(page, "GET", f"/?token={page.token}") == 200
+
+
+def test_an_address_that_is_no_address_is_refused(page: Page) -> None:
+    for address in ("x", "70000", f"{urlsplit(page.url).port}", "no-such-host.invalid:0"):
+        with pytest.raises(InputError), served(address):
+            pass
+
+
+def test_events_hold_everything_and_end_with_the_campaign(page: Page) -> None:
+    page.publish({"row": 1})
+    first, second = page.states(), page.states()
+    assert json.loads(next(first)) == json.loads(next(second)) == {"row": 1}
+    for row in (2, 3):
+        page.publish({"row": row})
+    assert json.loads(next(first)) == {"row": 3}
+    page.close()
+    assert list(first) == []
+
+
+@pytest.fixture(scope="module")
+def campaign() -> dc.Campaign:
+    found = dc.Campaign(ARM.nominal, candidates=ARM.sample(20), target=ARM.sample(10, seed=1))
+    q, y = ARM.measure(16, seed=2)
+    y[14] += 0.02
+    found.add(q, y)
+    return found
+
+
+def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
+    state = json.loads(json.dumps(state_of(campaign, "0.5 mm expected; next: 1, 2", 1e-4), allow_nan=False))
+    assert state["state"] == "15 of 16 rows accepted; 0.5 mm expected"
+    assert [one["row"] for one in state["verdicts"]] == list(range(15, 7, -1))
+    assert len(state["done"]) == 16
+    assert len(state["links"]) == 7
+    empty = dc.Campaign(ARM.nominal)
+    empty.add(torch.zeros(6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    assert state_of(empty, "no model yet", None)["error"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: apt install chromium")
+@pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
+def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, scheme: Any) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    state = state_of(campaign, "0.5 mm expected; next: 1, 2", 1e-4)
+    root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
+        seen = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        said: list[str] = []
+        seen.on("pageerror", lambda error: said.append(str(error)))
+        seen.on("request", lambda asked: said.append(asked.url))
+        seen.goto(page.url)
+        page.publish(state)
+        seen.wait_for_selector("li")
+        assert seen.text_content("#error") == f"{state['error']:.2g} mm"
+        assert seen.locator("li .bad").count() == 1
+        drawn = "() => [...document.querySelectorAll('canvas')].map((c) => c.toDataURL())"
+        before = seen.evaluate(drawn)
+        seen.focus("#robot")
+        seen.keyboard.press("ArrowLeft")
+        after = seen.evaluate(drawn)
+        assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
+        assert seen.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        with seen.expect_response("**/reject?**"):
+            seen.focus("button[data-row='15']")
+            seen.keyboard.press("Enter")
+        with seen.expect_response("**/accept?**"):
+            seen.focus("button[data-row='14']")
+            seen.keyboard.press("Enter")
+        assert [page.decisions.get(timeout=5), page.decisions.get(timeout=5)] == [(15, False), (14, True)]
+        seen.reload()
+        seen.wait_for_selector("li")
+        page.publish(state | {"error": 0.123})
+        seen.wait_for_function("document.title === '0.12 mm'")
+        if "CAMPAIGN_SCREENSHOT" in os.environ:
+            seen.screenshot(path=f"{os.environ['CAMPAIGN_SCREENSHOT']}_{width}.png", full_page=True)
+        browser.close()
+    assert {urlsplit(url).netloc for url in said} == {urlsplit(page.url).netloc}

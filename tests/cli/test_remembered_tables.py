@@ -1,0 +1,100 @@
+"""What a model remembers of its table, sessions and devices, and what commands make of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from command_bank import Command
+from kind_bank import Kind, kind_named
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.cli.commands.correct import _reason
+from diffeo_calib.cli.options import Angle, Length, Rows, Units
+from diffeo_calib.cli.tables import rows_in_table
+from diffeo_calib.kinematics.evaluation import session_frames
+
+UNITS = Units(length=Length.mm, angle=Angle.deg)
+
+
+def of_session(kind: Kind, name: str) -> Any:
+    rows: Any = kind.source.golden.rows
+    return rows.rows([row for row, own in enumerate(rows.device_names) if own == name])
+
+
+def test_rows_of_one_session_are_judged_in_its_frame() -> None:
+    """Nothing is found from the rows: the model knows where the device stood; of a new session 6 numbers are."""
+    kind = kind_named("sessions")
+    frames = session_frames(kind.model)
+    assert len(frames) == 2
+    assert max(float((T - torch.eye(4, dtype=T.dtype)).abs().max()) for T in frames.values()) > 1e-3
+    for name in frames:
+        rows = of_session(kind, name)
+        found = dc.evaluate(kind.model, rows)
+        assert found.numbers == 0
+        assert 1e3 * found.rms < kind.source.worst_mm
+        new = dc.evaluate(kind.model, rows.with_sessions(["new"] * len(rows)))
+        assert new.numbers == 6
+        assert new.rms < 1.2 * found.rms
+
+
+def test_devices_of_readings_are_no_sessions() -> None:
+    kind = kind_named("several kinds")
+    same = kind.result.aligned(kind.data)
+    assert [part.kind for part in same.parts] == [part.kind for part in kind.data.parts]
+    assert_close(same.parts[0].points, kind.data.parts[0].points, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["distances", "several kinds"])
+def test_plans_keep_the_names_of_devices(name: str) -> None:
+    """Of two kinds with the same names the kind is said too."""
+    model = kind_named(name).model
+    names = [one for sensor in sensor_of(model) for one in getattr(getattr(sensor, "devices", None), "names", ())]
+    own = [(placed.kind, one) for placed in model.placement for one in placed.names]
+    expected = [one if name == "distances" else f"{kind} {one}" for kind, one in own]
+    assert sorted(names) == sorted(expected)
+
+
+def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
+    rows = Rows(
+        position=["x,y,z"], reading=["distance=wire", "image=u,v,9,9,1,1"], socket="place,socket", session="day"
+    )
+    rows = replace(rows, distance=["0,1=50"], distance_std=0.03)
+    path = tmp_path / "t.csv"
+    path.write_text("q1,x,y,z\n1,2,3,4\n")
+    found, missing = rows_in_table(path, rows, UNITS)
+    assert found == Rows(position=["x,y,z"])
+    assert missing == ["--socket", "--reading distance=wire", "--reading image=u,v,9,9,1,1"]
+    path.write_text("q1,u,v,day\n1,2,3,4\n")
+    assert rows_in_table(path, rows, UNITS)[0] == Rows(reading=["image=u,v,9,9,1,1"], session="day")
+    path.write_text("q1,a\n1,2\n")
+    assert rows_in_table(path, rows, UNITS) == (rows, [])  # a table of other columns: the reader says so
+
+
+def test_a_correction_that_the_limit_refuses_is_named() -> None:
+    class Found:
+        status = ("singular", "unreachable", "limit")
+
+    words = [_reason(Found(), row) for row in range(3)]  # pyright: ignore
+    assert all("--limit" in text for text in words[:2])
+    assert words[2] == "limit"
+
+
+def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: Any) -> None:
+    """A model that `fit` made knows them; of another one they are to be stated."""
+    kind = kind_named("positions")
+    path = tmp_path / "q.csv"
+    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
+    refused = command("correct", kind.file, path, "-o", tmp_path / "c.csv")
+    assert refused.code == 1
+    assert "--length" in refused.err
+    made = kind.model.provenance
+    assert made is not None
+    told = replace(made, command="diffeo-calib fit t.csv --position x,y,z --length mm --angle deg")
+    dc.save(kind.model.with_provenance(told), tmp_path / "m.safetensors")
+    done = command("correct", tmp_path / "m.safetensors", path, "-o", tmp_path / "c.csv")
+    assert done.code == 0, done.err
