@@ -199,11 +199,12 @@ class OpenPlaces:
     directions w of unit variance that |S D w|^2 = c^2 (|S_0 D w|^2 + noise^2) for a large c.
 
     Args:
-        motions: (M m, k) of the points at the configurations of the workspace. names: (6 + 3 P, k) the directions.
+        motions: (M m, k) of the points at the configurations of the workspace.
+        directions: (6 + 3 P, k) of base and markers, m and rad.
     """
 
     motions: Tensor
-    names: Tensor
+    directions: Tensor
 
     @classmethod
     def of(cls, fitted: FittedMap) -> OpenPlaces:
@@ -233,7 +234,7 @@ class OpenPlaces:
 
     def names_on(self, model: CalibratedKinematics) -> tuple[str, ...]:
         """The places in words, each once: a marker that moves together with the base is what a turn would show."""
-        return tuple(dict.fromkeys(_name(direction, model) for direction in self.names.mT))
+        return tuple(dict.fromkeys(_name(direction, model) for direction in self.directions.mT))
 
 
 MARKER_SHARE = 0.3
