@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array
 from diffeo_calib.kinematics.tool import ToolKinematics
-from diffeo_calib.runtime.build import calibrated_chain, nominal_chain
+from diffeo_calib.runtime.build import calibrated_chain
 
 SOME_LENGTH = 0.5
 """m that a radian counts as where directions of a robot without a finite reach are compared."""
@@ -88,8 +88,8 @@ def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str)
     """Those of the geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
     geometry, robot = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    nominal, errors = nominal_chain(robot.to_config()), geometry.joint_errors.numpy()
-    chain = calibrated_chain(nominal, start, errors, np.zeros(6 + 6 * robot.moving), None)
+    errors = geometry.joint_errors.numpy()
+    chain = calibrated_chain(robot.arrays, start, errors, np.zeros(6 + 6 * robot.moving), None)
     numbers, ends = [robot.tips.index(tip) for tip in tools], chain.tips.copy()
     ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
     chain = replace(chain, tips=ends)
