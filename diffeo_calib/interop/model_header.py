@@ -28,7 +28,7 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.provenance import OF_POSITIONS, Provenance, Summary
+from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -196,9 +196,7 @@ def rebuild(
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
-        summary = Summary.from_dict(header["report"]) if header["report"] else None
-        if summary is not None and fitted.workspace is not None:  # files of old versions have those of readings
-            summary = replace(summary, **dict.fromkeys(OF_POSITIONS))
+        summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
         given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
         given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "scales": tensors.get(SCALES)}
         given["ball"] = header.get("ball", False) is True

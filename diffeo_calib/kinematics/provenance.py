@@ -168,14 +168,18 @@ class Summary:
         return values
 
     @classmethod
-    def from_dict(cls, entries: Mapping[str, Any]) -> Summary:
+    def from_dict(cls, entries: Mapping[str, Any], *, positions: bool = True) -> Summary:
         """The inverse of :meth:`to_dict`.
+
+        Args:
+            entries: of a file. positions: whether any was measured: old files have errors of other rows in their place.
 
         Raises:
             InputError: an entry is missing or unknown, or its value has another type.
         """
         known = {name for name, _ in ENTRIES.values()}
         values = {field: _value(entries, field) for field in ENTRIES}
+        values |= {} if positions else dict.fromkeys(OF_POSITIONS)
         parts = {}
         for name, value in entries.items():
             if name not in known:
