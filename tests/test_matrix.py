@@ -388,6 +388,9 @@ def _(bench: Bench) -> None:
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
     assert found.model.summary is not None
+    kept = {(own.kind, name) for own in found.model.placement for name in own.names}
+    assert {(own.kind, name) for own in kind.model.placement for name in own.names} <= kept
+    assert all(bool(own.mean.isfinite().all()) for own in found.model.predict_readings(kind.q(3)))
     bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.recalibrate", lambda *_, **__: found)
     table, options = kind.table("moved")
     bench.judged("recalibrate", kind.file, table, *options, "-o", bench.folder / "again.safetensors")

@@ -42,7 +42,7 @@ from diffeo_calib.sensors.tables import Coordinates
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
 NUMBERS_OF_A_SOCKET = 3
-LARGEST_RMS_M = 5e-3
+LARGEST_MEDIAN_M = 5e-3
 """Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
 
 
@@ -275,11 +275,13 @@ class OtherDevices(Sensor):
         """The devices, with the standard deviations of their increments."""
         found = placed(data, points)
         seen = found.points_of(points)
-        rms = float(found.errors(data, seen).norm(dim=1).square().mean().sqrt())
-        if rms > LARGEST_RMS_M:
+        median = float(found.errors(data, seen).norm(dim=1).median())
+        if median > LARGEST_MEDIAN_M:
             fix = "recalibrate, which finds another ball; or check the rows"
-            expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
-            raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
+            expected, got = f"at most {1e3 * LARGEST_MEDIAN_M:g} mm at the ball", f"{1e3 * median:.3g} mm"
+            raise MeasurementError.of(
+                "median error of readings at the best places", expected=expected, got=got, fix=fix
+            )
         deviations = found.open_deviations(data, seen)
         return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
 

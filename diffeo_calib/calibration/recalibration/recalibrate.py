@@ -44,7 +44,7 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import warn_about
+from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.errors import Evaluations
@@ -192,6 +192,8 @@ def _result(
     ball = place.new_ball or (knows_ball(model) and not _ball_measured(place))
     again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
+    again.placement = carried_devices(model, again, place.transform)
+    again.placement = devices_beside(again, new)
     before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.left_out))
     if model.summary is not None:
         known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
