@@ -10,20 +10,19 @@ Each line is answered by one, in order. A row that is answered is on the disk, w
 
     {"id": 7, "line": 8, "row": 6, "fits": true, "accepted": true, "error_mm": 0.03, "usual_mm": 0.04, "cause": "",
      "change": null, "text": "row 6 fits: ...", "revised": [], "expected_error_mm": 0.21, "more_rows": 14,
-     "next": [{"joint_1": 12.9, ..., "joint_6": -40.2}]}
+     "target_reached": false, "next": [{"joint_1": 12.9, ..., "joint_6": -40.2}], "rows": 7, "accepted_rows": 7}
     {"id": 7, "error": "the line was not taken in, and why"}
 
-`fits` is null as long as there is no model, `more_rows` without a target. `change`: what changed before the row
-(`row`, `cause`, `others`, `size`, `unit`, `fix`); `revised`: earlier rows that are taken in or left out since this one.
+`fits` is null as long as there is no model; `more_rows` and `target_reached` belong to a target. `change`: what changed
+before the row (`row`, `cause`, `others`, `size`, `unit`, `fix`); `revised`: earlier rows taken in or left out by this.
 
 `id` is optional: a number or a word that is a column of the table and tells rows apart. After a cut connection, a
 program sends the rows again that were not answered: a row whose id the table has is answered and not taken in again.
 
-Other objects: `{}` asks for `rows`, `accepted`, `expected_error_mm`, `more_rows` and `next`; `{"do": "reject", "row":
-5}` leaves a row out, "accept" takes it in, "repeat" leaves it out and puts its pose first among the next. A socket
-answers `{}` by itself when a connection begins, and says `"ended": true` when the campaign ends. Where it needs a
-token, `{"token": "..."}` is the first line. A line that is no JSON object ends its connection: browsers, too, can send
-text to local ports.
+Other objects: `{}` asks for the last six of these alone; `{"do": "reject", "row": 5}` leaves a row out, "accept" takes
+it in. A socket answers `{}` by itself when a connection begins, and says `"ended": true` when the campaign ends. Where
+it needs a token, `{"token": "..."}` is the first line. A line that is no JSON object ends its connection: browsers,
+too, can send text to local ports.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ import secrets
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from queue import SimpleQueue
+from queue import Queue, SimpleQueue
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 from threading import Event, Lock, Thread
 from typing import Any, NamedTuple
@@ -79,7 +78,7 @@ def _is_cell(value: object) -> bool:
     return value is None or isinstance(value, int | float) or (isinstance(value, str) and value.isprintable())
 
 
-def read_lines(lines: Iterable[bytes], inbox: SimpleQueue[Sent | None], answer: Callable[[Entry], object]) -> None:
+def read_lines(lines: Iterable[bytes], inbox: Queue[Sent | None], answer: Callable[[Entry], object]) -> None:
     """Put what lines hold into an inbox, and None at their end; what is no object with the reason."""
     for text in lines:
         try:
@@ -90,7 +89,7 @@ def read_lines(lines: Iterable[bytes], inbox: SimpleQueue[Sent | None], answer: 
 
 
 @contextmanager
-def listening(address: str, token: str, inbox: SimpleQueue[Sent | None]) -> Iterator[Listener]:
+def listening(address: str, token: str, inbox: Queue[Sent | None]) -> Iterator[Listener]:
     """Put what comes over a socket at ``HOST:PORT`` into an inbox; PORT 0 is any free one.
 
     Args:
@@ -130,7 +129,7 @@ class Listener(ThreadingTCPServer):
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, place: tuple[str, int], token: str, inbox: SimpleQueue[Sent | None]) -> None:
+    def __init__(self, place: tuple[str, int], token: str, inbox: Queue[Sent | None]) -> None:
         super().__init__(place, _Connection)
         self.address = f"{self.server_address[0]}:{self.server_address[1]}"
         self.token, self.inbox, self.last = token, inbox, {"ended": True}

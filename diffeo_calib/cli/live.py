@@ -124,6 +124,7 @@ class Live:
             elif entry:
                 number = self.ids.get(str(entry.get(ID)))
                 told = self.answer(self._append(entry) if number is None else number) | told
+            self.campaign.poll()
             told |= self.state()
         except InputError as error:
             told["error"] = str(error)
@@ -202,7 +203,7 @@ class Live:
         entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
         entry["expected_error_mm"] = None if known is None else 1e3 * known
         if self.goal.error is not None:
-            entry["more_rows"] = None if found is None else found.needed
+            entry |= {"more_rows": None if found is None else found.needed, "target_reached": self.reached()}
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
         poses = [] if found is None else columns.joints_from_si(found.q[: self.goal.poses]).tolist()

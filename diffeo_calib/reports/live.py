@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from queue import SimpleQueue
+from queue import Queue
 from threading import Condition, Thread
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -42,7 +42,7 @@ class Page:
         decisions: what the buttons decided, as programs send it.
     """
 
-    def __init__(self, server: ThreadingHTTPServer, token: str, decisions: SimpleQueue[Sent | None]) -> None:
+    def __init__(self, server: ThreadingHTTPServer, token: str, decisions: Queue[Sent | None]) -> None:
         host, port = str(server.server_address[0]), server.server_address[1]
         self.token, self.url = token, f"http://{host}:{port}/" + (f"?token={token}" if token else "")
         self.decisions = decisions
@@ -74,7 +74,7 @@ class Page:
 
 
 @contextmanager
-def served(address: str, decisions: SimpleQueue[Sent | None]) -> Iterator[Page]:
+def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
     """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
 
     Args:

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from queue import SimpleQueue
+from queue import Queue
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -40,7 +40,7 @@ def decided(page: Page) -> list[tuple[str, int]]:
 
 @pytest.fixture
 def page() -> Iterator[Page]:
-    with served("0", SimpleQueue()) as running:
+    with served("0", Queue()) as running:
         yield running
 
 
@@ -60,7 +60,7 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
 
 
 def test_another_address_needs_the_token() -> None:
-    with served("0.0.0.0:0", SimpleQueue()) as page:
+    with served("0.0.0.0:0", Queue()) as page:
         assert answer(page, "GET", "/") == answer(page, "GET", "/?token=wrong") == 403
         assert answer(page, "GET", "/events?token=") == 403
         assert answer(page, "GET", f"/?token={page.token}") == 200
@@ -68,7 +68,7 @@ def test_another_address_needs_the_token() -> None:
 
 def test_an_address_that_is_no_address_is_refused(page: Page) -> None:
     for address in ("x", "70000", f"{urlsplit(page.url).port}", "no-such-host.invalid:0"):
-        with pytest.raises(InputError), served(address, SimpleQueue()):
+        with pytest.raises(InputError), served(address, Queue()):
             pass
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue
 from threading import Thread
 
 import typer
@@ -29,7 +29,7 @@ JOURNAL = ".journal"
 """Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
 
-Inbox = SimpleQueue[Sent | None]
+Inbox = Queue[Sent | None]
 
 
 def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
@@ -46,7 +46,7 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
         campaign = Campaign(robot, candidates=candidates, background=not given.once)
         live = Live(campaign, source, links.tips, journal, goal)
         live.resume()
-        inbox: Inbox = SimpleQueue()
+        inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
         listener = None if given.listen is None else stack.enter_context(listening(given.listen, given.token, inbox))
         for where, face in (("shown", page and page.url), ("listening", listener and listener.address)):
@@ -91,6 +91,7 @@ def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
         try:
             sent = inbox.get(timeout=LOOK_SECONDS)
         except Empty:
+            yield live.campaign.poll()
             continue
         if sent is not None:
             live.take(sent)
@@ -102,7 +103,6 @@ def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
 def _end(live: Live, inbox: Inbox, listener: Listener | None) -> None:
     """Say how a campaign ended, also to those who have sent something since."""
     state = live.state() | {"ended": True}
-    state |= {} if live.goal.error is None else {"target_reached": live.reached()}
     if listener is not None:
         listener.last = state
     while not inbox.empty():
