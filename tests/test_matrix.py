@@ -1,8 +1,7 @@
-"""Every verb on every kind of measurement: it works, or physics is why not, or it is named here as missing.
+"""Every verb works on every kind of measurement.
 
 A verb is a function below; it calls the verb for real, in Python or through the command line in this process, and
-checks a small claim about what it gives. ``EXCEPT`` holds the pairs that cannot work, with words of the message that
-says why. ``NOT_YET`` holds those that should work and do not; the test of such a pair fails as soon as it does work.
+checks a small claim about what it gives.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -428,16 +426,6 @@ def _(bench: Bench) -> None:
 
 # --- the table ------------------------------------------------------------------------------------------------------
 
-WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
-OWN = ("laser beams", "inclinations")
-"""Kinds of devices from outside the package, beside positions and beside poses."""
-BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
-EXCEPT: dict[tuple[str, str], str] = {}
-"""Why a pair cannot work: words of the message that says so."""
-NOT_YET: dict[tuple[str, str], str] = {
-    **{(verb, kind): "refused" for verb in ("init",) for kind in OWN},
-}
-"""How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
 """Verbs of seconds: but for positions and the table of several kinds they are slow tests."""
 
@@ -465,19 +453,4 @@ def parameter(name: str, kind: str) -> Any:
 @pytest.mark.parametrize(("name", "kind"), [parameter(*pair) for pair in PAIRS])
 def test_the_verb_works_on_the_kind(name: str, kind: str, command: Command, tmp_path: Path) -> None:
     found = outcome(Bench(kind_named(kind), command, tmp_path), name)
-    if (name, kind) in EXCEPT:
-        assert found.startswith("refused: "), found
-        assert EXCEPT[name, kind] in found
-    elif (name, kind) in NOT_YET:
-        assert found != "works", "now it works: remove the pair from NOT_YET"
-        assert found.startswith(NOT_YET[name, kind]), found
-    else:
-        assert found == "works"
-
-
-def test_the_tables_name_pairs_that_exist() -> None:
-    assert set(EXCEPT) | set(NOT_YET) <= set(PAIRS)
-    assert not set(EXCEPT) & set(NOT_YET)
-    counts = Counter(text.partition(":")[0] for text in NOT_YET.values())
-    works = len(PAIRS) - len(EXCEPT) - len(NOT_YET)
-    print(f"\n{len(PAIRS)} pairs: {works} work, {len(EXCEPT)} refused by physics, not yet: {dict(counts)}")
+    assert found == "works"
