@@ -82,7 +82,8 @@ class Feed:
         while True:
             try:
                 if self.lines is None:
-                    self.lines = socket.create_connection(self.place, timeout=60).makefile("rw", encoding="utf-8")
+                    with socket.create_connection(self.place, timeout=60) as connection:
+                        self.lines = connection.makefile("rw", encoding="utf-8")
                     self.lines.readline()  # how the campaign is
                 self.lines.write(json.dumps(row) + "\n")
                 self.lines.flush()
@@ -121,6 +122,7 @@ def main() -> None:
                 answer = measured(feed, robot, tracker, number)
                 number += 1
         print(f"{answer['accepted_rows']} of {answer['rows']} rows, {answer['expected_error_mm']:.2f} mm expected")
+        feed.lines.close()
         campaign.communicate()
 
 
