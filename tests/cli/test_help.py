@@ -30,7 +30,19 @@ OPTIONS = {
     ],
     "campaign": [
         *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session", *DRIFT),
-        *("--payload", "--target", "--stdin", "--once", "--candidates", "--page", "--next", "--accepted"),
+        *(
+            "--payload",
+            "--target",
+            "--stdin",
+            "--listen",
+            "--token",
+            "--json-lines",
+            "--once",
+            "--candidates",
+            "--page",
+            "--next",
+            "--accepted",
+        ),
     ],
     "evaluate": [
         *(
