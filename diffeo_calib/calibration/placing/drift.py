@@ -17,6 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import skew
@@ -144,4 +145,5 @@ class Drift(DeviceSet):
 
 def worth_it(before: LeaveOneOut, after: LeaveOneOut) -> bool:
     """Whether rows that are left out prove a drift."""
-    return after.rms < WORTH * before.rms
+    first, second = (float(known(one.errors).square().mean()) for one in (before, after))
+    return second < WORTH**2 * first
