@@ -8,6 +8,7 @@ three shifts of every marker (a tool that was mounted again), which its rows sha
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, SeenRows, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.fitting.result import Progress
@@ -128,6 +129,15 @@ class SessionFrames(DeviceSet):
     def groups(self) -> list[tuple[str, Tensor]]:
         """See :class:`DeviceSet`."""
         return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
+
+    def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
+        """See :class:`DeviceSet`."""
+        session, points, count = self.session[own.rows], own.table.points, self.markers
+        for number, name in enumerate(self.names):
+            T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
+            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - seen[:, :count]
+            applies = (session != number) & (session != NO_SOCKET)
+            yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     @property
     def others(self) -> list[int]:
