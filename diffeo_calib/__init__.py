@@ -166,6 +166,7 @@ _MODULE_OF = {
 """The module that defines each public name, as in the imports above."""
 _FOLDERS = (
     "calibration",
+    "cameras",
     "campaign",
     "cli",
     "common",
@@ -181,6 +182,7 @@ _FOLDERS = (
     "reports",
     "robots",
     "runtime",
+    "sensors",
 )
 
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
@@ -201,4 +203,5 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
 
 def __dir__() -> list[str]:
     """All names of the package, whether they are loaded yet or not."""
-    return sorted({*globals(), *__all__, *_FOLDERS, "plots"})
+    dunder = {name for name in globals() if name.startswith("__")}
+    return sorted({*dunder, *__all__, *_FOLDERS, "plots"})

@@ -218,7 +218,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     """Print how far each export is from the model, and about how far from new measurements."""
     known = model.summary
     about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
-    if stands_free(model):  # errors of the fit are spreads or those of readings, which flatter
+    if stands_free(model):  # errors of the fit are spreads or those of readings, which are too small
         about, new = ExpectedError.of(model).whole, "true positions, about"
     title = f"Distance from the model over its {len(model.configurations)} measured configurations, mm"
     table = Table(title=title, title_justify="left")

@@ -16,28 +16,27 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
 from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.table_format import TableFormat
 
 
 class Wanted(NamedTuple):
-    """The board as a text, unit of places on it, standard deviation of its size as a share, separator."""
+    """The board as a text, standard deviation of its size as a share, unit of places on it and marks of the tables."""
 
     board: str
-    length: str
     board_std: float
-    sep: str
+    table: TableFormat
 
 
 def run(folder: Path, joints: Path, wanted: Wanted, output: Path, overview: Path | None) -> None:
     """Find the board, and write corners, camera and overview."""
-    found = read_folder(folder, joints, Board.of(wanted.board), wanted.sep)
+    found = read_folder(folder, joints, Board.of(wanted.board), wanted.table.sep)
     for one in found.images:
         if one.refused:
             say(f"{one.name}: {one.refused}: left out")
     text, camera = io.StringIO(newline=""), output.with_suffix(".yaml")
-    sheet = csv.writer(text, delimiter=wanted.sep)
+    sheet = csv.writer(text, delimiter=wanted.table.sep)
     sheet.writerow([IMAGE, *found.header, *POINT, *PIXEL])
-    sheet.writerows(found.rows(UNITS_PER_METRE[wanted.length]))
+    sheet.writerows(found.rows(wanted.table.per_metre, wanted.table.decimal))
     contents = {output: text.getvalue().encode()}
     contents[camera] = camera_text(found.camera(BoardPrior(scale=wanted.board_std))).encode()
     if overview is not None:
