@@ -139,6 +139,18 @@ class DataConditional(Conditional):
         """(G + R)^-1 target: (N, m) -> (N, m)."""
         return self.solve(target[:, :, None])[:, :, 0]
 
+    def inverse_blocks(self, rows: int) -> Tensor:
+        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m); only where there is a factor of G + R."""
+        raise NotImplementedError
+
+    def left_out(self, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (N, m) of every configuration predicted by all others, [(G + R)^-1]_ii^-1 mu_i, and their covariance.
+
+        The covariance (N, m, m) holds the noise of the configuration itself.
+        """
+        own = torch.linalg.inv(self.inverse_blocks(len(target)))
+        return (own @ self.mu(target)[:, :, None])[:, :, 0], own
+
     def momenta(self, target: Tensor) -> Momenta:
         """mu transported back to time 0."""
         return self.linearisation.momenta(self.mu(target))

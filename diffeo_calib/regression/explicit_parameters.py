@@ -56,9 +56,8 @@ class ExplicitParameterRegression(FeatureConditional, DataConditional):
         found = torch.linalg.solve_triangular(self.factor.T, white, upper=True)
         return self.dense.spread(found).view_as(values)
 
-    def inverse_blocks(self) -> Tensor:
-        """[(G + R)^-1]_ii for each of the N configurations: (N, m, m)."""
-        rows = len(self.linearisation.sensitivity)
+    def inverse_blocks(self, rows: int) -> Tensor:
+        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
         with large_work(self.factor.numel()):
             fields = self.dense.inverse_blocks(rows)
             known = torch.linalg.solve_triangular(self.factor.T, self.white, upper=True)
