@@ -32,4 +32,8 @@ if not TYPE_CHECKING:
         "joints": "comparison expected_error explained transmissions",
         "trust": "learning_curve residuals uncertainty",
     }
-    __getattr__, __dir__ = lazy_names(__name__, modules)
+    __getattr__, _ = lazy_names(__name__, modules)
+
+    def __dir__() -> list[str]:
+        """The plots, so that consoles complete their names."""
+        return list(__all__)
