@@ -87,10 +87,11 @@ class Verdict:
     Args:
         row: its number. fits: whether it is where the accepted rows before it predict it; None if they could not yet.
         accepted: whether it was taken in.
-        error: how far it is from its prediction, m: RMS of its numbers. expected: the same as expected.
+        error: how far it is from its prediction, m at the tool: RMS of its numbers. expected: the same as expected.
         cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
         expected_error: error of the robot over the target after this row, m; None before the first model.
         decided: whether the user accepted or rejected it.
+        shown: unit in which errors of its kind are shown, and how many of it are a metre at the tool.
     """
 
     row: int
@@ -102,11 +103,15 @@ class Verdict:
     change: Change | None = None
     expected_error: float | None = None
     decided: bool = False
+    shown: tuple[str, float] = ("mm", 1e3)
 
     def __str__(self) -> str:
         if self.fits is None:
             return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}"
-        size = f"{1e3 * self.error:.3g} mm from its prediction, {1e3 * self.expected:.2g} mm are usual"
+        unit, per_metre = self.shown
+        size = (
+            f"{per_metre * self.error:.3g} {unit} from its prediction, {per_metre * self.expected:.2g} {unit} are usual"
+        )
         how = "fits" if self.fits and self.change is None else "looks wrong"
         text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
         return text if self.change is None else f"{text}; {self.change}"

@@ -80,6 +80,19 @@ def test_rows_of_a_fit_linearised_around_it_lead_to_it() -> None:
     torch.testing.assert_close((A.mT @ pull[:, :, None])[:, :, 0], end, rtol=1e-6, atol=1e-6 * float(end.abs().max()))
 
 
+def test_old_rows_of_readings_keep_their_payloads() -> None:
+    """Heights are linear in the points: rows linearised around the fit are the measured ones but for each plane."""
+    model = again_bank.model(again_bank.laden_height)
+    away = model.map.linearised_rows()[1] - model.map.measured()
+    for device in range(3):  # devices take turns
+        own = away[device::3]
+        torch.testing.assert_close(own, own.mean().expand_as(own), rtol=0, atol=1e-6)
+    again = dc.recalibrate(model, again_bank.laden_height(ARM, 30, 5)).model
+    for mass in (0.0, 10.0):
+        old, new = (again_bank.true_error(one.with_payload(mass), ARM, mass) for one in (model, again))
+        assert new < 1.1 * old
+
+
 def test_two_models_of_readings_are_compared() -> None:
     model = again_bank.model(again_bank.height)
     found = dc.compare(model, model, count=100)
