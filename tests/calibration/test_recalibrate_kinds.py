@@ -12,6 +12,7 @@ import again_bank
 import pytest
 import torch
 from again_bank import CASES, Again
+from kind_bank import kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
@@ -117,6 +118,22 @@ def test_a_recalibrated_model_keeps_its_tool() -> None:
     found = dc.recalibrate(model, again_bank.positions(ARM, 12, 5)).model
     assert torch.equal(found.tool, tool)
     assert found.tool_tip == ARM.nominal.tip
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_recalibrated_model_keeps_its_devices(seen: bool) -> None:
+    """Beside the robot in the new frame; where new rows see them as these say: one that has moved by 3 mm does so."""
+    kind = kind_named("several kinds")
+    model, rows, q = kind.model, kind.moved, kind.q(30)
+    positions, heights = (part for part in rows.parts if part.kind in ("position", "height"))
+    new = dc.Observations.joined([positions, replace(heights, values=heights.values + 3e-3)]) if seen else positions
+    again = dc.recalibrate(model, new).model
+    before, after = model.predict_readings(q), again.predict_readings(q)
+    assert [(one.kind, one.device) for one in after] == [(one.kind, one.device) for one in before]
+    for one, other in zip(before, after, strict=True):
+        further = 3.0 * (seen and one.kind == "height")
+        allowed = 5 * (one.deviations.square() + other.deviations.square()).sqrt()
+        assert bool(((other.mean - one.mean - further).abs() < allowed)[one.mean.isfinite()].all()), one.device
 
 
 def test_a_session_that_deviates_is_a_change_and_no_outliers() -> None:
