@@ -139,45 +139,18 @@ def images_command(
             help="Table of joint values; its column `image` names files, else rows are in their order.",
         ),
     ],
-    board: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="BOARD",
-            help="Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, "
-            "chessboard:7x5:SQUARE (inner corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
-        ),
-    ],
-    length: Annotated[options.Length, typer.Option("--length", help="Unit of places on the board in the output.")],
+    given: options.BoardImages,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table of corners to write.")],
-    board_std: Annotated[
-        float,
-        typer.Option(
-            "--board-std", help="Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured."
-        ),
-    ] = 1e-3,
-    overview: Annotated[
-        Path | None, typer.Option("--overview", metavar="HTML", help="Write a page with all images and their corners.")
-    ] = None,
-    sep: Annotated[str, typer.Option("--sep", help="Separator of both tables.")] = ",",
-    decimal: Annotated[str, typer.Option("--decimal", help="Decimal mark of both tables.")] = ".",
 ) -> None:
     """Find a printed board in a folder of images.
 
     Writes a line for each corner, and beside the table a file .yaml of the camera, for `fit --reading corners=FILE`.
     Images that do not show the board are named with the reason and left out.
     """
-    check_outputs({"-o": output, "--overview": overview}, {"FOLDER": folder, "JOINTS": joints})
+    check_outputs({"-o": output, "--overview": given.overview}, {"FOLDER": folder, "JOINTS": joints})
     from diffeo_calib.cli.commands import images  # noqa: PLC0415
-    from diffeo_calib.measurements.table_format import TableFormat  # noqa: PLC0415
 
-    images.run(
-        folder,
-        joints,
-        images.Wanted(board, board_std, TableFormat(length.value, "rad", sep, decimal)),
-        output,
-        overview,
-    )
+    images.run(folder, joints, given, output)
 
 
 @command("predict")

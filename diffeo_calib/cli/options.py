@@ -99,10 +99,7 @@ CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a heade
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
 OldModel = Annotated[Path, typer.Argument(metavar="OLD", help="Model file of an earlier calibration.")]
 ModelOutput = Annotated[Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write.")]
-TestSeed = Annotated[
-    int,
-    typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the simulated rows behind the tests for changes."),
-]
+TestSeed = Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the tests for changes.")]
 Note = Annotated[
     str, typer.Option("--note", metavar="TEXT", help="Text to keep in the model file, such as a serial number.")
 ]
@@ -255,10 +252,7 @@ class Robot:
     robot: Path = option("The robot's description.", "URDF", default=...)
     base: str = option("First link of the chain.", "LINK", default=...)
     tip: Tip
-    load: list[str] | None = option(
-        "Last link of another branch, which carries no marker but bends the robot by its weight; repeat for more.",
-        "LINK",
-    )
+    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,6 +336,25 @@ class Page:
     tolerance: str | None = option(
         "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardImages:
+    """A printed board in images, and the tables of joint values and corners."""
+
+    board: str = option(
+        "Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner "
+        "corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
+        "BOARD",
+        default=...,
+    )
+    length: Length = option("Unit of places on the board in the output.", default=...)
+    board_std: float = option(
+        "Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured.", default=1e-3
+    )
+    overview: Path | None = option("Write a page with all images and their corners.", "HTML")
+    sep: str = option("Separator of both tables.", default=",")
+    decimal: str = option("Decimal mark of both tables.", default=".")
 
 
 # --- the commands that apply models -------------------------------------------------------------------------------

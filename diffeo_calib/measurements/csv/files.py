@@ -242,25 +242,23 @@ def read_measurements(
     tip = None if not on or isinstance(on, str) else on[-1]
     names = (socket,) if isinstance(socket, str) else tuple(socket or ())
     sockets = None if socket is None else SocketColumns(names, distances, distance_std, tip)
-    named, kinds = _joint_columns(robot, joints, kinds)
-    columns = TableColumns(named, position, sockets, session=session, kinds=kinds, on=on)
-    data = read_observations(path, columns, table, duplicates=duplicates)
-    return data if joints is None else data.with_joint_names(_names_of(robot))
+    columns = TableColumns(robot, position, sockets, session=session, kinds=kinds, on=on)
+    return _read(path, columns, table, duplicates, joints)
 
 
-def _joint_columns(
-    robot: Sequence[str] | ChainLike, joints: Sequence[str] | None, kinds: Sequence[str] | None
-) -> tuple[Any, Sequence[str] | None]:
-    """Names of the joint columns, or the robot that has them, and the kinds of the joints."""
+def _read(
+    path: str | PathLike[str], columns: TableColumns, table: TableFormat, duplicates: str, joints: Sequence[str] | None
+) -> Any:
+    """Read columns, whose joints may have other names in the file than in the robot."""
+    robot = columns.joints
     if joints is None:
-        return robot, kinds
-    if not isinstance(robot, ChainLike) and len(robot) != len(joints):
-        raise MeasurementError.of("`joints`", expected=f"{len(robot)} columns", got=len(joints))
-    return joints, robot.kinds if kinds is None and isinstance(robot, ChainLike) else kinds
-
-
-def _names_of(robot: Sequence[str] | ChainLike) -> Sequence[str]:
-    return robot.joint_names if isinstance(robot, ChainLike) else robot
+        return read_observations(path, columns, table, duplicates=duplicates)
+    names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
+    if len(names) != len(joints):
+        got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
+        raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
+    columns = replace(columns, joints=joints, kinds=columns.kinds or kinds)
+    return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
 
 
 def read_table(
@@ -336,10 +334,7 @@ def read_readings(
     known = () if given is None else column_names("std", given, "names of columns", several)
     of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or PLAIN, known, on)
     table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
-    named, kinds = _joint_columns(robot, joints, kinds)
-    columns = TableColumns(named, readings=(of_kind,), kinds=kinds)
-    data = read_observations(path, columns, table, duplicates=duplicates)
-    return data if joints is None else data.with_joint_names(_names_of(robot))
+    return _read(path, TableColumns(robot, readings=(of_kind,), kinds=kinds), table, duplicates, joints)
 
 
 def read_joints(
