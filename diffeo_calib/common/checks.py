@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from diffeo_calib.common.data_frames import ARRAY_KINDS, real_array
 from diffeo_calib.common.device import outside_inference_mode
@@ -166,11 +167,12 @@ def check_seed(seed: object, what: str = "`seed`") -> int:
 def wrapped(tensor: Tensor) -> bool:
     """Whether code must not branch on the values of ``tensor``.
 
-    This is so inside a ``torch.func`` transform, and while ``torch.compile``, ``torch.export`` or ``torch.jit.trace``
-    record a program. Checks of values are left out there: a recorded program does not check its input.
+    This is so inside a ``torch.func`` transform, for a tensor with a forward-mode tangent, and while ``torch.compile``,
+    ``torch.export`` or ``torch.jit.trace`` record a program. Checks of values are left out there: a recorded program
+    does not check its input.
     """
     recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
-    return recorded or is_functorch_wrapped_tensor(tensor)
+    return recorded or is_functorch_wrapped_tensor(tensor) or unpack_dual(tensor).tangent is not None
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:
