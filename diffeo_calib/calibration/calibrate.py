@@ -239,7 +239,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
     warn_of_contradictions(model, placed.coordinates, found, _change(placed, chosen))
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
-    rms = [*placed.stage_rms(model), _left_out_rms(chosen, placed)]
+    rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
@@ -263,14 +263,8 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     )
 
 
-def _left_out_rms(chosen: ChosenScales, placed: Placed) -> float:
-    """Root mean square of leave-one-out errors, m, of measured positions where there are any: others are spreads."""
-    rows = placed.positions
-    return chosen.left_out.rms if rows is None else chosen.left_out.rows(rows).rms
-
-
 def _summary(
-    rms: list[float], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
+    rms: list[float | None], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
 ) -> Summary:
     """Numbers and sentences that travel with the model; ``rms`` of registration, geometry, model and left out, m."""
     registration, geometry, diffeomorphic, left_out = rms

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.cells import number, read_cells
+from diffeo_calib.measurements.readings import MILLIMETRES
+from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
@@ -24,12 +26,6 @@ UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE
 
 PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
 """A letter before x, y, z that says what they are: translation, position, measured."""
-READINGS = {
-    "distance": ("distance", "dist", "range", "bar"),
-    "displacement": ("displacement", "wire", "draw_wire", "interferometer"),
-    "height": ("height", "gauge", "dial", "dial_gauge", "indicator"),
-}
-"""Names of columns by the word of `fit --reading`."""
 PIXELS = ("u", "v"), ("pixel_u", "pixel_v"), ("u_px", "v_px")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
@@ -134,12 +130,17 @@ def guess_sockets(header: Sequence[str]) -> list[str] | None:
 
 
 def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
-    """Texts of `fit --reading` of devices that measure one number, and of images, by names; their columns."""
+    """Texts of `fit --reading` of all kinds of devices, by the names of their columns; these columns."""
     found = dict[str, list[str]]()
-    for word, known in READINGS.items():
-        own = next((name for name in columns if UNITS.sub("", name).lower() in known), None)
-        if own is not None and [own] not in found.values():
-            found[f"{word}={own}"] = [own]
+    for kind in known_kinds().values():
+        numbers = [""] if kind.numbers_each == 1 else [f"{k + 1}" for k in range(kind.numbers_each)]
+        unit = UNITS if kind.unit == MILLIMETRES else re.compile(rf"[_ ]*[\[(]?{re.escape(kind.unit[0])}[\])]?$")
+        there = {_plain(unit.sub("", name)): name for name in reversed(columns)}
+        for word, known in kind.columns().items():
+            each = ([f"{_plain(name)}{number}" for number in numbers] for name in known)
+            own = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
+            if own is not None and own not in found.values():
+                found[f"{word}={','.join(own)}"] = own
     names = {name.lower(): name for name in columns}
     pixels = next(([names[name] for name in pair] for pair in PIXELS if set(pair) <= set(names)), None)
     if pixels is not None:
@@ -186,4 +187,9 @@ def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -
 
 def _bare(name: str) -> str:
     """A name without unit, case and signs."""
-    return re.sub(r"[^a-z0-9]", "", UNITS.sub("", name).lower())
+    return _plain(UNITS.sub("", name))
+
+
+def _plain(name: str) -> str:
+    """A name without case and signs."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())

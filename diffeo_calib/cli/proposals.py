@@ -44,7 +44,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import divided, measured_positions
+from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
 """Widths and heights of images, pixels."""
@@ -156,12 +156,10 @@ def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str
 
 def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
-    if source.rows.readings:
-        yield "", "", "beside readings no rotations and deviations were looked for"
-    elif source.sockets:
+    if source.sockets:
         lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
         yield from (("", "", line) for line in lines)
-    else:
+    if source.markers:
         yield from rotation(source)
         yield from deviations(source)
 
@@ -205,9 +203,12 @@ class Source:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                found = measured_positions(self.read(table))
+                data = self.read(table)
+                if table.rotation is not None:
+                    check_poses(data)
             except DiffeoCalibError:
                 return None
+        found = measured_positions(data)
         return None if found is None else found.largest_session()
 
     def _columns(self, table: TableFormat) -> TableColumns:
@@ -231,14 +232,17 @@ class Source:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                return self._residual(self.read(table))
+                return self.read_residual(table)
             except DiffeoCalibError:
                 return inf
 
-    def _residual(self, data: Any) -> float:
+    def read_residual(self, table: TableFormat) -> float:
+        """The same; DiffeoCalibError says why a table cannot be read so, or calibrates nothing."""
+        data = self.read(table)
         positions = measured_positions(data)
         if positions is not None:
             return residual_of(self.robot, positions.largest_session())
+        check_poses(data)
         own, readings = divided(data)
         if own is not None:
             return _in_sockets(self.robot, own.table)

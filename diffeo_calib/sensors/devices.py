@@ -8,7 +8,7 @@ new kind of device is a subclass of :class:`Devices` in a file of its own, regis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -87,6 +87,11 @@ class Devices(ABC):
     @abstractmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
+
+    @classmethod
+    def columns(cls) -> Mapping[str, Sequence[str]]:
+        """Usual names of a column of readings, by the word of `fit --reading`; several columns are numbered from 1."""
+        return {cls.kind: (cls.kind,)}
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

@@ -53,6 +53,11 @@ class Planes(Devices):
         return [PLACES.found_m_rad] * 3
 
     @classmethod
+    def columns(cls) -> dict[str, tuple[str, ...]]:
+        """Of gauges."""
+        return {"height": ("height", "gauge", "dial", "dial_gauge", "indicator")}
+
+    @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """Normals of any length, and distances from the origin along them."""
         normals = numbers[:, :3] / numbers[:, :3].norm(dim=1, keepdim=True)

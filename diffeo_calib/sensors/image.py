@@ -38,6 +38,11 @@ class Cameras(Devices):
         return [PLACES.found_m_rad] * 6
 
     @classmethod
+    def columns(cls) -> dict[str, tuple[str, ...]]:
+        """None: images need a lens too."""
+        return {}
+
+    @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """Places of the cameras, and points that they look at; their turn about that line tells nothing."""
         line = numbers[:, 3:] - numbers[:, :3]

@@ -44,6 +44,12 @@ class FixedPoints(Devices):
         return [PLACES.found_m_rad] * 3 + [offset_std or FIXED_DEVIATION_M]
 
     @classmethod
+    def columns(cls) -> dict[str, tuple[str, ...]]:
+        """Of absolute lengths, and of those with an unknown zero."""
+        zero = "displacement", "wire", "draw_wire", "interferometer"
+        return {"distance": ("distance", "dist", "range", "bar"), "displacement": zero}
+
+    @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """The fixed points."""
         return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)

@@ -20,6 +20,7 @@ from diffeo_calib.cli.guesses import (
     guess_deviations,
     guess_joints,
     guess_positions,
+    guess_readings,
     guess_rotation,
     guess_sheet,
 )
@@ -393,3 +394,29 @@ def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, command: C
     assert "reading" not in written
     assert written["session"] == "session"
     assert "not used: distance" in (tmp_path / "c.toml").read_text()
+
+
+def test_columns_of_kinds_from_outside_the_package() -> None:
+    """By the name of the kind, numbered where a reading is several numbers; in the kind's own unit if one is said."""
+    assert kind_named("laser beams")  # registers both kinds
+    names = ["Line_Distance [mm]", "inclination_1_mrad", "inclination 2"]
+    assert guess_readings(names) == {
+        "line distance=Line_Distance [mm]": names[:1],
+        "inclination=inclination_1_mrad,inclination 2": names[1:],
+    }
+    assert not guess_readings(["inclination_1_deg", "inclination_2_deg", "line"])
+
+
+def test_a_kind_from_outside_alone(tmp_path: Path, command: Command) -> None:
+    """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
+    said = {}
+    for name in ("laser beams", "inclinations"):
+        kind = kind_named(name)
+        table = tmp_path / f"{name[:3]}.csv"
+        rows = kind.source.golden.rows.parts[1].with_joint_names(kind.robot.joint_names)
+        write_measurements(table, rows, TableFormat("mm", "deg"))
+        said[name] = command("init", table, kind.urdf, "-o", tmp_path / "c.toml")
+    assert said["laser beams"].code == 0
+    assert "line distance=line distance" in tomllib.loads((tmp_path / "c.toml").read_text())["reading"]
+    assert said["inclinations"].code == 1
+    assert "measured poses" in said["inclinations"].err

@@ -29,7 +29,19 @@ OPTIONS = {
     ],
     "campaign": [
         *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session"),
-        *("--payload", "--target", "--stdin", "--once", "--candidates", "--page", "--next", "--accepted"),
+        *(
+            "--payload",
+            "--target",
+            "--stdin",
+            "--listen",
+            "--token",
+            "--json-lines",
+            "--once",
+            "--candidates",
+            "--page",
+            "--next",
+            "--accepted",
+        ),
     ],
     "evaluate": [
         *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),

@@ -201,7 +201,7 @@ def change_during(
     return sentence(
         f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
         expected="one set-up for all rows, in the order of their numbers",
-        got=f"leave-one-out errors of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with this change in the model",
+        got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
         fix=SLOW if best.drifts else f"check what happened then; {best.cause.fix}",
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
+from math import inf
 from os.path import relpath
 from pathlib import Path
 
@@ -118,6 +119,8 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
         if seen:
             yield from seen
             return
+        if best == inf:
+            source.read_residual(TableFormat(length, angle, sheet.sep, sheet.decimal))  # says why
         got = "; ".join(
             f"{' and '.join(filter(None, units))}: {source.size(value)}" for units, value in residuals.items()
         )

@@ -20,7 +20,7 @@ ROWS_AT_ONCE = 4096
 
 
 class Solution(NamedTuple):
-    """Commands (N, n) in rad or m, poses of the tool (N, 4, 4) or of T tools (N, T, 4, 4), statuses' codes (N,)."""
+    """Commands (N, n) in rad or m, poses of the tools (N, T, 4, 4), statuses' codes (N,)."""
 
     q: Array
     poses: Array
@@ -105,7 +105,7 @@ class CompensationProblem:
         return Solution(q, poses, codes)
 
     def _no_poses(self, count: int) -> Array:
-        return np.full((count, *self.targets.pose_shape), np.nan)
+        return np.full((count, self.targets.tools, 4, 4), np.nan)
 
 
 WEAK = 0.1
