@@ -141,7 +141,7 @@ def evaluate(
     """
     at = columns if rows is None else rows
     tensors = at.tensors + columns.tensors
-    if any(map(wrapped, tensors)) or profile.followed or len(at.features) == 0 or len(columns.features) == 0:
+    if wrapped(*tensors) or profile.followed or len(at.features) == 0 or len(columns.features) == 0:
         name = "dense"  # plain operations without a choice by size: torch.func, torch.compile and torch.export need it
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
