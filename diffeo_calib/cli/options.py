@@ -204,6 +204,8 @@ class Rows:
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
     payload: PayloadColumn = None
+    time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
+    temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
     rotation: list[str] | None = option(
         "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
         "several tips once per --position.",
