@@ -48,6 +48,7 @@ def test_errors_are_loaded_without_torch() -> None:
 
 def test_every_public_name_is_loaded_and_listed() -> None:
     assert set(dc.__all__) <= set(dir(dc))
+    assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))
     for name in dc.__all__:
         assert getattr(dc, name).__module__.startswith("diffeo_calib.")
     assert len(set(dc.__all__)) == len(dc.__all__)
@@ -76,8 +77,9 @@ def test_submodules_do_not_hide_functions() -> None:
 
 def test_names_seen_by_type_checkers_are_those_that_are_loaded() -> None:
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    (checking,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     imports = [
-        node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "diffeo_calib." in str(node.module)
+        node for node in ast.walk(checking) if isinstance(node, ast.ImportFrom) and "diffeo_calib." in str(node.module)
     ]
     seen = {alias.name: node.module for node in imports for alias in node.names}
     assert set(seen) == {*dc.__all__, "plots"}

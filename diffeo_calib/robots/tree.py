@@ -269,7 +269,7 @@ class Tree:
         """Geometric Jacobian (N, 6, n) at the tip's origin by the active joints; (N, tips, 6, n) if there are several.
 
         Expressed in the base. Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for
-        slides].
+        prismatic joints].
         """
         q = self.joint_values(q)
         places, ends = self.places(q), self.tip_places
@@ -350,7 +350,7 @@ def seen_from(
     while link != BASE:
         way.append(link)
         end = last[link]
-        for joint in _backwards(joints[link]):
+        for joint in backwards(joints[link]):
             end = add(joint, end)
         link = parents[link]
         last[link] = end
@@ -360,7 +360,7 @@ def seen_from(
     return found, before, last
 
 
-def _backwards(joint: Joint) -> list[Joint]:
+def backwards(joint: Joint) -> list[Joint]:
     """The joint from its link to its parent: its motion, then a fixed transform."""
     turned = joint.origin[:3, :3].T
     back = transforms(turned, -turned @ joint.origin[:3, 3])

@@ -1,11 +1,12 @@
 """Dispatch of kernel sums: choose a backend and evaluate a formula on it.
 
-dense   one materialised (M, N) matrix
-fused   one loop compiled for the processor (llvmlite); fastest on a CPU; memory O(M + N)
-tiled   matrices on tiles that fit the cache, in plain torch; memory O(M + N)
-keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
-distributed   tiles shared by the processes of one program (torchrun)
-auto    one of the first four, by the number of pairs, the device and what is installed
+name         how it sums                                            memory     when
+dense        one matrix of all pairs                                O(M N)     few points
+fused        one loop compiled for the processor (extra `fused`)    O(M + N)   fastest on a CPU
+tiled        matrices on tiles that fit the cache, in plain torch   O(M + N)   works everywhere
+keops        LazyTensors, compiled by KeOps (extra `keops`)         O(M + N)   fastest on a GPU, for many points
+distributed  tiles shared by the processes of one torchrun program  O(M + N)   several processes
+auto         dense, fused, tiled or keops, by the number of pairs, the device and what is installed
 
 With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
 (single.py), whatever the backend.
@@ -140,11 +141,12 @@ def evaluate(
         the formula's results, each with M rows.
     """
     at = columns if rows is None else rows
-    if wrapped(at.features) or len(at.features) == 0 or len(columns.features) == 0:
+    tensors = at.tensors + columns.tensors
+    if wrapped(*tensors) or profile.followed or len(at.features) == 0 or len(columns.features) == 0:
         name = "dense"  # plain operations without a choice by size: torch.func, torch.compile and torch.export need it
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
-    followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
+    followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
     if accuracy is not None and name != "dense" and not followed and _finite(at, columns):

@@ -34,7 +34,6 @@ from diffeo_calib.kinematics.compensation.kinematics import tool_functions
 from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Room, Solution, Status
 from diffeo_calib.kinematics.compensation.targets import (
     Array,
-    Pointing,
     Targets,
     checked_targets,
     finite_rows,
@@ -142,7 +141,7 @@ def compensate(
             targets of all tips (T, 4, 4) or (T, 3).
         frame: frame of the targets, "base" or "measuring".
         bound: largest motion of a joint away from its start: one number in rad for all turning joints, or one for each
-            joint in rad or m. Default 1 degree, 0.02 m for slides; ten times that where rows start at the row before.
+            joint in rad or m. Default 1 degree, 0.02 m if prismatic; ten times that where rows start at the row before.
         limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
             limit is brought back if the bound allows it.
         weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2,
@@ -170,14 +169,13 @@ def compensate(
     check_number(lever, "`lever`", above=0.0)
     wanted, robot = real_tensor(targets, "targets"), model.robot
     begin, following = _starts(start, robot, wanted)
-    goals = checked_targets(wanted, robot, len(begin), Pointing(axis, tool_axis, lever))
+    goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     exact, rough = tool_functions(model, tools, frame)
-    limited = joint_limits(robot, limits)
     motion = largest_motion(robot, bound, FOLLOWING if following and bound is None else 1.0)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
-    room = Room(begin, limited.low, limited.high, motion, mobilities(robot, weights, tuple(tools), aimed))
-    problem = CompensationProblem(exact, rough, goals, room, limited)
+    room = Room(begin, joint_limits(robot, limits), motion, mobilities(robot, weights, tuple(tools), aimed))
+    problem = CompensationProblem(exact, rough, goals, room)
     pace = _pace(robot, room, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))
