@@ -203,6 +203,9 @@ class Rows:
         "KIND=COLUMN",
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
+    remounted: bool = option(
+        "Between the set-ups of --session the device stayed, and the markers were mounted anew.", default=False
+    )
     payload: PayloadColumn = None
     rotation: list[str] | None = option(
         "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "

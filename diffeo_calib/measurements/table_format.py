@@ -39,6 +39,7 @@ class TableFormat:
         joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
         payload: name of the column with the known mass that the robot carries, in any unit.
         camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
+        remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -57,6 +58,7 @@ class TableFormat:
     joint_length: str | None = None
     payload: str | None = None
     camera_on_tool: bool = False
+    remounted: bool = False
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
