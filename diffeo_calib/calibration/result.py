@@ -130,7 +130,7 @@ class CalibrationResult:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
         devices = self.placed.devices_by_stage[STAGES.index(stage)]
         by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
-        return Places(self.sessions, by_key, self.placed.ball)
+        return Places(self.placement, by_key, self.placed.ball)
 
     def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
         """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.

@@ -13,10 +13,10 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from math import log
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -115,6 +115,12 @@ class Verdict:
         how = "fits" if self.fits and self.change is None else "looks wrong"
         text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
         return text if self.change is None else f"{text}; {self.change}"
+
+    def entry(self) -> dict[str, Any]:
+        """The same for programs: lengths in mm, and the sentence."""
+        same = {name: getattr(self, name) for name in ("row", "fits", "accepted", "cause")}
+        sizes = {"error_mm": 1e3 * self.error, "usual_mm": 1e3 * self.expected}
+        return same | sizes | {"change": self.change and asdict(self.change), "text": str(self)}
 
 
 class Measure(NamedTuple):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from math import isinf
 from os import PathLike
@@ -23,6 +22,7 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_constants import LANES, array, flow_constants, number, pose, poses, sag_constants
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.provenance import package_version
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.program import TOOL_LEVER, Program, inverse, tool_points
@@ -168,7 +168,7 @@ def _texts(program: Program, settings: Settings, stem: str, prefix: str) -> dict
         "macro": prefix.upper(),
         "n": program.chain.n,
         "markers": len(program.markers),
-        "generated": f"{GENERATED} {_version()}",
+        "generated": f"{GENERATED} {package_version()}",
         "robot": _comment(settings.robot),
         "joints": [_comment(line) for line in settings.joints],
         "frame_name": settings.frame_name,
@@ -275,13 +275,6 @@ def _prefix(stem: str, given: str | None) -> str:
         expected = "letters, digits and _ that begin with a letter"
         raise InputError.of("the prefix of names in C", expected=expected, got=as_written(name), fix="pass `prefix`")
     return name
-
-
-def _version() -> str:
-    try:
-        return version(PACKAGE)
-    except PackageNotFoundError:  # copied instead of installed
-        return "(unknown version)"
 
 
 def _comment(text: str) -> str:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, outside_inference_mode
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.rows import RowGroups
@@ -262,18 +262,6 @@ def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
     found = OutsideRange(model)
     found.add(q)
     found.warn()
-
-
-def check_plausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
-    """Warn of errors so large that the measurements were probably read in another way than they were written.
-
-    Raises MeasurementError for errors that say nothing about the robot; arguments as of :func:`implausible`.
-    """
-    text = implausible(model, data, errors)
-    if text is not None and impossible(model, errors):
-        raise MeasurementError(text)
-    if text is not None:
-        warn_user(text)
 
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:

@@ -48,7 +48,7 @@ class Provenance:
         check_note(note)
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
         table = "" if measurements.origin is None else measurements.origin.options
-        return cls(date, _version(), measurements.sha256, note, table=table)
+        return cls(date, package_version(), measurements.sha256, note, table=table)
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any]) -> Provenance:
@@ -88,7 +88,8 @@ def check_note(note: object) -> None:
         raise InputError.of("`note`", expected=f"at most {LONGEST_NOTE} characters", got=len(note), fix=fix)
 
 
-def _version() -> str:
+def package_version() -> str:
+    """Version of this package."""
     try:
         return version(PACKAGE)
     except PackageNotFoundError:  # copied instead of installed

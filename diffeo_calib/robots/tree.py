@@ -350,7 +350,7 @@ def seen_from(
     while link != BASE:
         way.append(link)
         end = last[link]
-        for joint in _backwards(joints[link]):
+        for joint in backwards(joints[link]):
             end = add(joint, end)
         link = parents[link]
         last[link] = end
@@ -360,7 +360,7 @@ def seen_from(
     return found, before, last
 
 
-def _backwards(joint: Joint) -> list[Joint]:
+def backwards(joint: Joint) -> list[Joint]:
     """The joint from its link to its parent: its motion, then a fixed transform."""
     turned = joint.origin[:3, :3].T
     back = transforms(turned, -turned @ joint.origin[:3, 3])

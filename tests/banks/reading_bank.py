@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tangent_bank import normal
 from torch import Tensor
@@ -43,10 +45,11 @@ def readings(
     *,
     seed: int = 1,
     payload: float | Tensor | None = None,
+    turned: Callable[[Tensor], Tensor] = lambda q: q,
 ) -> dc.Readings:
     q, which = arm.sample(rows, seed), torch.arange(rows) % 3
     names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=seed + 2)
-    z, joints = in_base(arm, q, payload), arm.nominal.joint_names
+    z, joints = in_base(arm, turned(q), payload), arm.nominal.joint_names
     if kind == "image":
         seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=seed + 2)
         return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)

@@ -67,7 +67,8 @@ NEW_SET_UP = "name the set-ups in a column (`session`), or use the rows before o
 TWO_ROBOTS = "calibrate the rows before it, and recalibrate that model with the rows after it"
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
-    "measure in random order, so that the drift averages out"
+    "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
+    "then drifts"
 )
 
 

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_direction
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherRows, Placement, seen_rows
 from diffeo_calib.calibration.placing.readings import (
@@ -220,6 +221,11 @@ class Placed:
         seen = seen_rows(data)
         return replace(data, shared=self.placement.shared(seen), held=held)
 
+    def drifting(self) -> Placed | None:
+        """The same with what may drift with columns of the table; None without such columns."""
+        drift = Drift.of_table(self.data, self.registration.geometry.chain)
+        return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
+
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.
 
@@ -231,7 +237,7 @@ class Placed:
         """
         coordinates, readings = divided(data)
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
-        other = OtherRows(coordinates, readings, len(data), centre)
+        other = OtherRows(data, coordinates, readings, len(data), centre)
         placement = Placement(tuple(one.with_rows(other) for one in self.placement))
         if coordinates is not None:
             table = placement.aligned(coordinates.table)

@@ -34,7 +34,6 @@ from diffeo_calib.kinematics.compensation.kinematics import tool_functions
 from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Room, Solution, Status
 from diffeo_calib.kinematics.compensation.targets import (
     Array,
-    Pointing,
     Targets,
     checked_targets,
     finite_rows,
@@ -170,14 +169,13 @@ def compensate(
     check_number(lever, "`lever`", above=0.0)
     wanted, robot = real_tensor(targets, "targets"), model.robot
     begin, following = _starts(start, robot, wanted)
-    goals = checked_targets(wanted, robot, len(begin), Pointing(axis, tool_axis, lever))
+    goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     exact, rough = tool_functions(model, tools, frame)
-    limited = joint_limits(robot, limits)
     motion = largest_motion(robot, bound, FOLLOWING if following and bound is None else 1.0)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
-    room = Room(begin, limited.low, limited.high, motion, mobilities(robot, weights, tuple(tools), aimed))
-    problem = CompensationProblem(exact, rough, goals, room, limited)
+    room = Room(begin, joint_limits(robot, limits), motion, mobilities(robot, weights, tuple(tools), aimed))
+    problem = CompensationProblem(exact, rough, goals, room)
     pace = _pace(robot, room, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))

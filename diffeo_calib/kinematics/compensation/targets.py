@@ -174,19 +174,6 @@ def finite_rows(value: object, name: str, shape: tuple[int | str, ...], fix: str
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-@dataclass(frozen=True)
-class Pointing:
-    """Directions in which one axis of the tool shall point, as given, and how orientation weighs against position.
-
-    Args:
-        axis: for every target a direction (3,), or None. tool_axis: "x", "y" or "z". lever: m.
-    """
-
-    axis: object
-    tool_axis: str
-    lever: float
-
-
 def for_each_tip(targets: Tensor, robot: Tree) -> bool:
     """Whether the targets (N, T, 4, 4) or (N, T, 3) are those of all tips, rather than (N, 4, 4) or (N, 3) of one.
 
@@ -202,8 +189,13 @@ def for_each_tip(targets: Tensor, robot: Tree) -> bool:
     return True
 
 
-def checked_targets(targets: Tensor, robot: Tree, rows: int, pointing: Pointing) -> Targets:
+def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, tool_axis: str, lever: float) -> Targets:
     """Targets (N, 4, 4) or (N, 3) of one tool, or (N, T, 4, 4) or (N, T, 3) of all, NaN where a tool may be anywhere.
+
+    Args:
+        targets: as given. robot: with the T tips. rows: N.
+        axis: for every target the direction (3,) in which one axis of the tool shall point, or None.
+        tool_axis: that axis, "x", "y" or "z". lever: how orientation weighs against position, m.
 
     Raises:
         InputError: wrong shapes, values that are not finite, no rigid transforms, no directions, or a row in which all
@@ -212,7 +204,7 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, pointing: Pointing)
     fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
     if not for_each_tip(targets, robot):
         finite_rows(targets, "targets", (rows, 4, 4) if targets.ndim == 3 else (rows, 3), fix)
-        return Targets(**_parts(targets[:, None], pointing, "row {}".format))
+        return Targets(**_parts(targets[:, None], axis, tool_axis, "row {}".format), lever=lever)
     tips, one = targets.shape[1], targets.shape[2:]
     free = targets[..., :3, :].isnan().flatten(2).all(2) if len(one) == 2 else targets.isnan().all(2)
     idle = free.all(1).nonzero()[:, 0].tolist()
@@ -221,34 +213,33 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, pointing: Pointing)
     anywhere = torch.eye(4, dtype=targets.dtype, device=targets.device) if len(one) == 2 else targets.new_zeros(3)
     filled = torch.where(free.reshape(*free.shape, *[1] * len(one)), anywhere, targets)
     finite_rows(filled, "targets", (rows, tips, *one), f"{fix} and every tip, NaN for a free tip")
-    if pointing.axis is not None:
-        given = real_tensor(pointing.axis, "axis")
+    if axis is not None:
+        given = real_tensor(axis, "axis")
         if given.shape != (rows, tips, 3):
             got, fix = tuple(given.shape), "pass one direction (3,) for every target"
             raise InputError.of("`axis` has the wrong shape", expected=(rows, tips, 3), got=got, fix=fix)
         upright = torch.tensor(AXES["z"], dtype=given.dtype, device=given.device)
-        given = torch.where(free[..., None].to(given.device), upright, given).flatten(0, 1)
-        pointing = replace(pointing, axis=given)
-    return Targets(**_parts(filled, pointing, lambda k: f"row {k // tips}, tip {k % tips}"), free=free.cpu().numpy())
+        axis = torch.where(free[..., None].to(given.device), upright, given).flatten(0, 1)
+    parts = _parts(filled, axis, tool_axis, lambda k: f"row {k // tips}, tip {k % tips}")
+    return Targets(**parts, lever=lever, free=free.cpu().numpy())
 
 
-def _parts(targets: Tensor, pointing: Pointing, place: Any) -> dict[str, Any]:
+def _parts(targets: Tensor, axis: object, tool_axis: str, place: Any) -> dict[str, Any]:
     """What :class:`Targets` is made of, from finite poses (N, T, 4, 4) or positions (N, T, 3)."""
-    axis, tool_axis, lever = pointing.axis, pointing.tool_axis, pointing.lever
     shape, flat = targets.shape[:2], targets.flatten(0, 1)
     if targets.ndim == 4:
         if axis is not None:
             raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
         found = rigid_poses(flat, lambda k: f"`targets`, {place(k)}") if len(flat) else flat
         poses = found.detach().cpu().numpy().astype(np.float64).reshape(*shape, 4, 4)
-        return {"position": poses[..., :3, 3], "rotation": poses[..., :3, :3], "lever": lever}
+        return {"position": poses[..., :3, 3], "rotation": poses[..., :3, :3]}
     if not isinstance(tool_axis, str) or tool_axis not in AXES:
         raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
     position = targets.detach().cpu().numpy().astype(np.float64)
     if axis is None:
-        return {"position": position, "lever": lever}
+        return {"position": position}
     directions = _unit(real_tensor(axis, "axis"), len(flat), place).reshape(*shape, 3)
-    return {"position": position, "axis": directions, "tool_axis": np.array(AXES[tool_axis]), "lever": lever}
+    return {"position": position, "axis": directions, "tool_axis": np.array(AXES[tool_axis])}
 
 
 def _unit(given: Tensor, count: int, place: Any) -> Array:
