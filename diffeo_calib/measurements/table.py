@@ -96,33 +96,10 @@ class Measurements(ImageTable, SocketTable):
             Nothing is dropped.
     """
 
-    BY_ROW = (
-        "q",
-        "points",
-        "poses",
-        "board",
-        "std",
-        "rotation_std",
-        "line_numbers",
-        "session",
-        "payload",
-        "socket",
-        "covariates",
-    )
-    BY_ROW = (*BY_ROW, *IMAGE_COLUMNS)
-    ALIKE = (
-        "joint_names",
-        "marker_names",
-        "on",
-        "lever",
-        "session_names",
-        "payload_at",
-        "covariate_names",
-        "sockets",
-        "n",
-        "markers",
-    )
-    ALIKE = (*ALIKE, "camera", "remounted")
+    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = (*BY_ROW, "covariates", *IMAGE_COLUMNS)
+    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (*ALIKE, "covariate_names", "camera", "remounted")
 
     q: Tensor
     points: Tensor
@@ -166,17 +143,8 @@ class Measurements(ImageTable, SocketTable):
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        set_attributes(
-            self,
-            session=None,
-            session_names=(),
-            remounted=False,
-            socket=None,
-            sockets=None,
-            payload=None,
-            payload_at=None,
-        )
-        set_attributes(self, file_sha256=None, origin=None)
+        set_attributes(self, session=None, session_names=(), remounted=False, socket=None, sockets=None)
+        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             self.check_every_marker_seen()
             self.warn_if_suspicious()
