@@ -187,7 +187,7 @@ def _ball(
     old: FittedMap, nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]
 ) -> Tensor | None:
     """(3,) where new rows put a ball on its tip, if the joints are as the old map says without deformation, m."""
-    geometry = _in_frame(old, nominal, torch.eye(4, dtype=nominal.geometry.base.dtype))
+    geometry = _in_frame(old, nominal, torch.eye(4, dtype=nominal.geometry.base.dtype, device=HOST))
     ball = None if own is None else ball_in_sockets(own.table, geometry)
     if ball is not None:
         return ball
