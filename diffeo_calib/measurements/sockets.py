@@ -29,8 +29,8 @@ Distances = Mapping[tuple[str, str], float]
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+    "the spread within sockets is smaller than the true error: it contains neither errors that all rows of a socket "
+    "share nor the robot's size, so that absolute errors are 2 to 6 times as large; choose nothing by it"
 )
 
 

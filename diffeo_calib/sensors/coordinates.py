@@ -393,11 +393,20 @@ def check_joint_order(robot: Tree, data: Any) -> None:
     """Raise InputError if the measurements name the robot's joints in another order, or only some of them."""
     names = data.joint_names or robot.joint_names
     if names != robot.joint_names and set(names) & set(robot.joint_names):
-        what, fix = (
-            f"the measurements' joints are not those of robot '{robot.name}'",
-            "put the columns in the robot's order",
-        )
+        what = f"the measurements' joints are not those of robot '{robot.name}'"
+        fix = joint_name_fix(robot, names)
         raise InputError.of(what, expected=listed(robot.joint_names), got=listed(names), fix=fix)
+
+
+def joint_name_fix(robot: Tree, names: Sequence[str]) -> str:
+    """What to do about joints of other names than the robot's, or in another order."""
+    if set(names) == set(robot.joint_names):
+        return "put the columns in the robot's order"
+    return (
+        "if they are the robot's joints in order, read the table with the robot and its columns "
+        "(`read_measurements(file, robot, ..., joints=[...])`), rename the columns, or name the joints of a DH table "
+        "after them (`from_dh(..., names=[...])`)"
+    )
 
 
 def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:

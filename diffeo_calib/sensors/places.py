@@ -71,7 +71,7 @@ class SessionPlaces:
         one = len(self.names) == 1
         whose = "the frame of the one session" if one else f"the frames of {len(self.names)} sessions"
         lines = [f"{whose} {'was' if one else 'were'} found from these rows, {self.fitted_numbers} numbers in all:"]
-        lines[0] += " errors of few rows flatter"
+        lines[0] += " with few rows the errors look smaller than they are"
         for name, T in zip(self.names, self.transforms, strict=True):
             turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
             away = f"{1e3 * float(T[:3, 3].norm()):.4g} mm and {1e3 * turn:.4g} mrad away"

@@ -88,7 +88,18 @@ OPTIONS = {
     ],
     "init": ["CSV", "URDF", "-o", "--output", "--force"],
     "images": [
-        *("FOLDER", "JOINTS", "--board", "--length", "-o", "--output", "--board-std", "--overview", "--sep"),
+        *(
+            "FOLDER",
+            "JOINTS",
+            "--board",
+            "--length",
+            "-o",
+            "--output",
+            "--board-std",
+            "--overview",
+            "--sep",
+            "--decimal",
+        ),
     ],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
