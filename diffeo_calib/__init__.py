@@ -13,8 +13,9 @@ scales, fits, rows that look wrong. ``logging.basicConfig(level=logging.INFO)`` 
 from __future__ import annotations
 
 import logging
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from diffeo_calib.common.lazy import lazy_names
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
@@ -110,95 +111,42 @@ __all__ = [
     "write_report",
 ]
 
-_MODULE_OF = {
-    "LBFGS": "fitting.lbfgs",
-    "RK4": "flows.integrators",
-    "RK8": "flows.integrators",
-    "CalibratedKinematics": "kinematics.calibrated",
-    "CalibrationResult": "calibration.calibrate",
-    "Campaign": "campaign.campaign",
-    "Cauchy": "kernels.radial",
-    "Chain": "robots.tree",
-    "Comparison": "calibration.recalibration.compare",
-    "Compensation": "kinematics.compensation.compensate",
-    "ModelComparison": "calibration.recalibration.compare",
-    "Recalibration": "calibration.recalibration.recalibrate",
-    "compare": "calibration.recalibration.compare",
-    "recalibrate": "calibration.recalibration.recalibrate",
-    "DHRow": "robots.dh",
-    "DiffeoCalibError": "common.errors",
-    "DiffeoCalibWarning": "common.errors",
-    "Fit": "fitting.result",
-    "GaussNewton": "fitting.gauss_newton",
-    "Gaussian": "kernels.radial",
-    "GradientDescent": "fitting.gradient_descent",
-    "Kernel": "kernels.base",
-    "Hyperparameters": "calibration.scales.hyperparameters",
-    "Matern": "kernels.radial",
-    "Measurements": "measurements.table",
-    "Observations": "measurements.observations",
-    "PerJoint": "kernels.radial",
-    "Plan": "calibration.planning.plan",
-    "Problem": "fitting.problem",
-    "Readings": "measurements.readings",
-    "Sensor": "calibration.planning.sensors",
-    "Space": "kernels.spaces",
-    "TorchDiffEq": "flows.torchdiffeq",
-    "Tracker": "calibration.planning.candidates",
-    "Tree": "robots.tree",
-    "VonMises": "kernels.radial",
-    "calibrate": "calibration.calibrate",
-    "candidates": "calibration.planning.candidates",
-    "compensate": "kinematics.compensation.compensate",
-    "evaluate": "kinematics.evaluation",
-    "joints_outside_range": "kinematics.evaluation",
-    "rows_used_in_fit": "kinematics.evaluation",
-    "fit": "fitting.fit",
-    "from_dh": "robots.dh",
-    "load": "interop.model_file",
-    "load_urdf": "robots.urdf",
-    "plan": "calibration.planning.plan",
-    "read_measurements": "measurements.csv.files",
-    "read_readings": "measurements.csv.files",
-    "save": "interop.model_file",
-    "write_report": "reports.report",
-}
-"""The module that defines each public name, as in the imports above."""
-_FOLDERS = (
-    "calibration",
-    "campaign",
-    "cli",
-    "common",
-    "fitting",
-    "flows",
-    "interop",
-    "kernels",
-    "kinematics",
-    "maps",
-    "measurements",
-    "paper",
-    "regression",
-    "reports",
-    "robots",
-    "runtime",
-)
-
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
-
-    def __getattr__(name: str) -> object:
-        """Load a public name, or a folder of this package, when it is first used."""
-        if name in _MODULE_OF:
-            value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-        elif name == "plots":
-            value = import_module(f"{__name__}.reports.plots")
-        elif name in _FOLDERS:
-            value = import_module(f"{__name__}.{name}")
-        else:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        globals()[name] = value
-        return value
-
-
-def __dir__() -> list[str]:
-    """All names of the package, whether they are loaded yet or not."""
-    return sorted({*globals(), *__all__, *_FOLDERS, "plots"})
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "calibration.calibrate": "CalibrationResult calibrate",
+            "calibration.planning.candidates": "Tracker candidates",
+            "calibration.planning.plan": "Plan plan",
+            "calibration.planning.sensors": "Sensor",
+            "calibration.recalibration.compare": "Comparison ModelComparison compare",
+            "calibration.recalibration.recalibrate": "Recalibration recalibrate",
+            "calibration.scales.hyperparameters": "Hyperparameters",
+            "campaign.campaign": "Campaign",
+            "common.errors": "DiffeoCalibError DiffeoCalibWarning",
+            "fitting.fit": "fit",
+            "fitting.gauss_newton": "GaussNewton",
+            "fitting.gradient_descent": "GradientDescent",
+            "fitting.lbfgs": "LBFGS",
+            "fitting.problem": "Problem",
+            "fitting.result": "Fit",
+            "flows.integrators": "RK4 RK8",
+            "flows.torchdiffeq": "TorchDiffEq",
+            "interop.model_file": "load save",
+            "kernels.base": "Kernel",
+            "kernels.radial": "Cauchy Gaussian Matern PerJoint VonMises",
+            "kernels.spaces": "Space",
+            "kinematics.calibrated": "CalibratedKinematics",
+            "kinematics.compensation.compensate": "Compensation compensate",
+            "kinematics.evaluation": "evaluate joints_outside_range rows_used_in_fit",
+            "measurements.csv.files": "read_measurements read_readings",
+            "measurements.observations": "Observations",
+            "measurements.readings": "Readings",
+            "measurements.table": "Measurements",
+            "reports": "plots",
+            "reports.report": "write_report",
+            "robots.dh": "DHRow from_dh",
+            "robots.tree": "Chain Tree",
+            "robots.urdf": "load_urdf",
+        },
+    )

@@ -9,7 +9,8 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ WHAT = {
     "inclinations": {("errors", "m"), ("readings", "mrad")},
 }
 """What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
+SHOWN = {"m": "mm"}
+TITLES = {"errors": "Position errors", "spread": "Spread within sockets"}
 
 
 class Refused(Exception):
@@ -90,11 +93,28 @@ class Bench:
         )
         csv_file, options = kind.table()
         table = [csv_file, *kind.robot_options, *options]
-        return self.json("fit", *table, "--holdout", "0", "-o", self.folder / "fit.safetensors", *more)
+        return self.judged("fit", *table, "--holdout", "0", "-o", self.folder / "fit.safetensors", *more)
+
+    def judged(self, *words: object) -> dict[str, Any]:
+        """The same of a command that tells errors: of every kind in its own unit, in the text and in the JSON."""
+        path = self.folder / "judged.json"
+        said = self.run(*words, "--json", path).out
+        found = json.loads(path.read_text(encoding="utf-8"))["results"]
+        own = WHAT.get(self.kind.name, {("errors", "m")})
+        shown = {(what, SHOWN.get(unit, unit)) for what, unit in own}
+        leaves = {kind: list(_leaves(entry)) for kind, entry in found["kinds"].items()}
+        assert {leaf for each in leaves.values() for leaf in each} == shown
+        assert bool(found["errors"]) == any(what == "errors" for what, _ in own)
+        text = " ".join(said.split())
+        for kind, each in leaves.items():
+            (what, unit), *_ = each
+            title = TITLES.get(what, f"Errors of {kind}s")
+            assert f"{title} in {unit}" in text or re.search(rf"{kind} [\d.]+ {unit}", text), (kind, text)
+        return found
 
     def evaluate(self, *more: object) -> dict[str, Any]:
         path, options = self.kind.table("new")
-        return self.json("evaluate", self.kind.file, path, *options, *more)
+        return self.judged("evaluate", self.kind.file, path, *options, *more)
 
     def joints(self, count: int = 4) -> Path:
         """A table of joint values in deg."""
@@ -119,6 +139,15 @@ def verb(name: str) -> Callable[[Verb], Verb]:
         return function
 
     return enter
+
+
+def _leaves(entry: Any) -> Iterator[tuple[str, str]]:
+    """What each evaluation of a tree is, and its unit."""
+    if "unit" in entry:
+        yield entry["what"], entry["unit"]
+    else:
+        for own in entry.values():
+            yield from _leaves(own)
 
 
 def finite(values: torch.Tensor) -> torch.Tensor:
@@ -177,8 +206,9 @@ def _(bench: Bench) -> None:
 @verb("fit --json")
 def _(bench: Bench) -> None:
     found = bench.fit()
-    assert found["errors"] or found["reading_errors"]
     assert {"status", "errors", "files", "parts", "outliers", "leave_one_out_rms_m"} <= set(found)
+    assert set(found["leave_one_out"]) == set(found["kinds"])
+    assert (found["leave_one_out_rms_m"] is None) == (not found["errors"])
 
 
 @verb("fit --report")
@@ -338,7 +368,7 @@ def _(bench: Bench) -> None:
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
     table, options = kind.table("moved")
-    bench.run("compare", kind.file, table, *options)
+    bench.judged("compare", kind.file, table, *options)
 
 
 @verb("compare two models")
@@ -358,6 +388,12 @@ def _(bench: Bench) -> None:
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
     assert found.model.summary is not None
+    kept = {(own.kind, name) for own in found.model.placement for name in own.names}
+    assert {(own.kind, name) for own in kind.model.placement for name in own.names} <= kept
+    assert all(bool(own.mean.isfinite().all()) for own in found.model.predict_readings(kind.q(3)))
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.recalibrate", lambda *_, **__: found)
+    table, options = kind.table("moved")
+    bench.judged("recalibrate", kind.file, table, *options, "-o", bench.folder / "again.safetensors")
 
 
 # --- other programs -------------------------------------------------------------------------------------------------
@@ -368,7 +404,9 @@ def _(bench: Bench) -> None:
     kind, folder = bench.kind, bench.folder
     names = {"--urdf": "a.urdf", "--dh": "dh.csv", "--joint-offsets": "o.csv", "--correction-tables": "t.csv"}
     written = [word for option, name in names.items() for word in (option, folder / name)]
-    bench.run("export", kind.file, *written, *bench.mass, *bench.one_tip)
+    said = bench.run("export", kind.file, *written, *bench.mass, *bench.one_tip).out
+    positions = any(what == "errors" for what, _ in WHAT.get(kind.name, {("errors", "m")}))
+    assert ("from the measured positions of the fit, mm" in said) == positions
     assert set(dc.load_urdf(folder / "a.urdf", kind.robot.base, kind.robot.tips[0]).joint_names) <= set(
         kind.robot.joint_names
     )

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -31,6 +32,7 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_wha
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.judgement import warn_of_contradictions
+from diffeo_calib.calibration.placing.drift import worth_it
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.result import CalibrationResult
@@ -113,7 +115,8 @@ def calibrate(
             several, in the frame of the measuring device; base frame and markers on the tool are estimated. Their
             standard deviations are used if they have any; noise beyond these is estimated. With payloads the sag under
             any payload is found. Or rows with a ball in sockets, or readings of distances, heights or images, whose
-            devices are found with the robot; or rows of several kinds, see :class:`Observations`.
+            devices are found with the robot; or rows of several kinds, see :class:`Observations`. A drift with columns
+            such as time or temperature (``with_covariates``) is part of the model where left-out rows prove it.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         scales_of: calibrated robots of the same type, whose mean scales are used, for 15 to 120 rows. They are
             inflated where leave-one-out errors of these rows contradict them.
@@ -160,8 +163,12 @@ def calibrate(
     check_not_nominal(robot, data, placed.registration, placed.identification)
     _warn_of_what_is_open(robot, placed, data)
     stages = placed.registration, placed.identification
-    given = {"given": hyperparameters, "models": scales_of}
-    chosen = choose_scales(data, measurements, *stages, **given, seed=seed, progress=progress)
+    choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
+    chosen = choose(data, measurements, *stages)
+    drifting = placed.drifting()
+    if drifting is not None:
+        again = choose(drifting.tangent_data(), measurements, *stages)
+        placed, chosen = (drifting, again) if worth_it(chosen.left_out, again.left_out) else (placed, chosen)
     LOG.info("scales: %s", chosen.selection.status)
     fitted = _fit(chosen, controls, backend, progress)
     return _result(robot, placed, chosen, fitted, note)
@@ -239,7 +246,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
     warn_of_contradictions(model, placed.coordinates, found, _change(placed, chosen))
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
-    rms = [*placed.stage_rms(model), _left_out_rms(chosen, placed)]
+    rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
@@ -263,14 +270,8 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     )
 
 
-def _left_out_rms(chosen: ChosenScales, placed: Placed) -> float:
-    """Root mean square of leave-one-out errors, m, of measured positions where there are any: others are spreads."""
-    rows = placed.positions
-    return chosen.left_out.rms if rows is None else chosen.left_out.rows(rows).rms
-
-
 def _summary(
-    rms: list[float], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
+    rms: list[float | None], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
 ) -> Summary:
     """Numbers and sentences that travel with the model; ``rms`` of registration, geometry, model and left out, m."""
     registration, geometry, diffeomorphic, left_out = rms

@@ -18,6 +18,7 @@ from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.coordinates import errors_of_kinds
 
 FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
@@ -39,9 +40,10 @@ class Outlier:
         marker: number of the marker; None if there is only one, or if poses were measured.
         tip: name of the tip, of poses on several; else None.
         number: line of the row in its file, see :attr:`Measurements.line_numbers`.
-        distance: from its prediction by all other rows, m.
+        distance: from its prediction by all other rows, m; of readings in m at the tool.
         weight: its weight in the fit, about 1 for inliers; None if it took no part in the fit.
         reason: probable cause, in words.
+        reading: what a reading is off by in its own unit, and this unit; None for measured positions.
     """
 
     row: int
@@ -51,6 +53,12 @@ class Outlier:
     weight: float | None
     reason: str
     tip: str | None = None
+    reading: tuple[float, str] | None = None
+
+    @property
+    def shown(self) -> tuple[float, str]:
+        """What it is off by, and the unit."""
+        return self.reading or (1e3 * self.distance, "mm")
 
 
 @dataclass(frozen=True)
@@ -145,9 +153,12 @@ def outliers(
         found += [replace(one, row=int(rows[one.row])) for one in own]
     for one in placed.readings:
         sizes = each[one.rows, 0].nan_to_num(0.0).norm(dim=1)
+        shown = errors_of_kinds(left_out.errors, None, [one]).main
+        unit, per_unit = shown.shown
         for number in bad[one.rows, 0].nonzero()[:, 0].tolist():
             row, line = int(one.rows[number]), int(one.data.lines[number])
-            found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR))
+            reading = per_unit * float(shown.errors[number, 0]), unit
+            found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR, reading=reading))
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 

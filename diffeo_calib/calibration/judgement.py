@@ -270,7 +270,7 @@ class Accuracy:
     """What is compared with a limit.
 
     Args:
-        value: RMS error, in ``unit``: m or px. of: what it is of, in words.
+        value: RMS error, in ``unit``: m or that of readings. of: what it is of, in words.
     """
 
     value: float
@@ -283,10 +283,10 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
 
     In m that of measured positions that took no part in the fit, of all if there are no others. Where no position was
     measured it is the one that the model expects over the joint ranges of its rows. A spread within sockets and errors
-    of readings are no accuracy, but the model is not more accurate than these. In px that of images.
+    of readings are no accuracy, but the model is not more accurate than these. In another unit that of its readings.
 
     Args:
-        found: errors of N rows. used: (N,) whether they were used in the fit. unit: m or px.
+        found: errors of N rows. used: (N,) whether they were used in the fit. unit: m, px, ...
 
     Raises:
         InputError: no row measured in this unit.
@@ -302,7 +302,7 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
         return measured[0]
     if unit != "m":
         fix = "give the limit in mm: without positions the error that the model expects is compared with it"
-        raise InputError.of("a limit in px", expected="rows of images", got=", ".join(found), fix=fix)
+        raise InputError.of(f"a limit in {unit}", expected="rows in this unit", got=", ".join(found), fix=fix)
     if not any(one.what == "errors" for one in own):
         of = "expected over the joint ranges of the fit, no position was measured"
         measured.append(Accuracy(ExpectedError.of(model).whole, unit, of))

@@ -29,7 +29,7 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import with_positions
 
@@ -46,8 +46,8 @@ class CalibrationResult:
         placed: the rows in the frame of the model, and their devices.
         selection: the scales of kernels, priors and noise, and how they were chosen.
         tails: how heavy the tails of the noise are, and the weight of every measurement.
-        leave_one_out: error of every configuration as predicted from all others, in closed form; left_out_rms: their
-            root mean square, m, of measured positions where there are any: those of rows in sockets are spreads.
+        leave_one_out: error of every configuration as predicted from all others, in closed form; left_out: their sizes,
+            kind by kind and in the unit of each.
         parts: how much each part of the model explains.
         gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
         outliers: measurements far from their prediction.
@@ -130,7 +130,7 @@ class CalibrationResult:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
         devices = self.placed.devices_by_stage[STAGES.index(stage)]
         by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
-        return Places(self.sessions, by_key, self.placed.ball)
+        return Places(self.placement, by_key, self.placed.ball)
 
     def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
         """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.
@@ -150,9 +150,14 @@ class CalibrationResult:
         return devices, devices.errors(data, devices.points_of(self.stages[stage](data.q).detach()))
 
     @property
+    def left_out(self) -> Evaluations:
+        """Sizes of leave-one-out errors by the kind of the rows: those of rows in sockets are spreads."""
+        return self.placed.by_kind(self.leave_one_out.errors)
+
+    @property
     def left_out_rms(self) -> float:
-        """Root mean square of leave-one-out errors, m."""
-        return self.leave_one_out.rms if self.model.summary is None else self.model.summary.leave_one_out_rms
+        """Root mean square of leave-one-out errors of measured positions, m; else see :attr:`Evaluations.rms`."""
+        return self.left_out.rms
 
     @property
     def gear_lines(self) -> tuple[NamedGearLine, ...]:

@@ -166,11 +166,11 @@ class Campaign:
         """Wait for a model that is made in the background."""
         if self._maker is not None:
             self._maker.join()
-        self._collect()
+        self.poll()
 
     def _add(self, row: int) -> None:
         """Judge one row of the table, and renew the model if it is due."""
-        self._collect()
+        self.poll()
         if self._model is None:
             self.verdicts.append(Verdict(row, None, accepted=True))
         else:
@@ -203,7 +203,7 @@ class Campaign:
             self._maker.start()
         else:
             self._make(*arguments)
-            self._collect()
+            self.poll()
 
     @small_work()
     def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
@@ -221,13 +221,16 @@ class Campaign:
         self.models += 1
         self._made.append(made)
 
-    def _collect(self) -> None:
-        """Put a new model in the place of the old one."""
+    @small_work()
+    def poll(self) -> bool:
+        """Put a model that was made in the background in the place of the old one; whether there was one."""
         if self._maker is not None and not self._maker.is_alive():
             self._maker = None
         if self._made:
             made = self._made.pop()
             self._model = made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
+            return True
+        return False
 
 
 def _positions(q: object, y: object) -> Measurements:

@@ -6,15 +6,19 @@ removed when the journal is opened again; the row is then judged again. One proc
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.common.files import FULL
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -42,7 +46,7 @@ class Journal:
         self.path = path
         with ExitStack() as stack:
             try:
-                self._file = stack.enter_context(path.open("a+b"))
+                self._file = stack.enter_context(path.open("a+b", buffering=0))
                 if fcntl is not None:
                     fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -60,15 +64,12 @@ class Journal:
         self._stack.close()
 
     def add(self, entries: Iterable[dict[str, Any]]) -> None:
-        """Append entries, whole or not at all; InputError where the disk is full."""
-        start, text = self._file.seek(0, os.SEEK_END), "".join(json.dumps(one) + "\n" for one in entries)
+        """Append entries, whole or not at all; DiffeoCalibError where the disk is full."""
+        text = "".join(json.dumps(one) + "\n" for one in entries)
         try:
-            self._file.write(text.encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            append_whole(self._file, text.encode())
         except OSError as error:
-            os.ftruncate(self._file.fileno(), start)
-            raise InputError.of(f"{self.path} cannot be written ({error.strerror})", fix="free some space") from error
+            raise DiffeoCalibError.of(f"{self.path} cannot be written ({error.strerror})", fix=FULL) from error
 
     def _read(self) -> list[dict[str, Any]]:
         self._file.seek(0)
@@ -83,19 +84,31 @@ class Journal:
             raise InputError.of(what, got=str(error), fix="name another journal, or move it away") from error
 
 
+def append_whole(file: FileIO, content: bytes) -> None:
+    """Append to an unbuffered file and bring it to the disk; OSError, and the file as before, if that fails."""
+    start, rest = file.seek(0, os.SEEK_END), memoryview(content)
+    try:
+        while rest:
+            rest = rest[file.write(rest) :]
+        os.fsync(file.fileno())
+    except OSError:
+        file.truncate(start)
+        raise
+
+
 class GrowingTable:
-    """A CSV file to which another program appends lines: those that are complete, from the last look on.
+    """A CSV file to which lines are appended, by other programs too: those that are complete, from the last look on.
 
     Args:
-        path: the file, whose first line names the columns.
+        path: the file, whose first line names the columns. sep: their separator. decimal: mark of the numbers.
 
     Attributes:
         header: that line; empty before it is there. count: complete lines seen after it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, sep: str = ",", decimal: str = ".") -> None:
         self.path, self.header, self.count = path, b"", 0
-        self._place = 0
+        self._sep, self._decimal, self._place = sep, decimal, 0
 
     def new_lines(self) -> list[bytes]:
         """Complete lines that were appended since the last call; InputError if the file has become shorter."""
@@ -117,6 +130,48 @@ class GrowingTable:
             self.header, lines = lines[0], lines[1:]
         self.count += len(lines)
         return lines
+
+    def cells(self, line: bytes) -> list[str]:
+        """The cells of a line."""
+        return next(csv.reader([line.decode(errors="replace")], delimiter=self._sep), [])
+
+    def written(self, row: dict[str, Any]) -> tuple[bytes, bytes]:
+        """The header and the line of a row: column -> value; InputError for columns that the table does not have."""
+        header = self.cells(self.header) or list(row)
+        unknown = [name for name in row if name not in header]
+        if unknown:
+            expected = f"those of {self.path.name}: {few(header)}"
+            raise InputError.of(f"columns {few(unknown)} of a row", expected=expected)
+        values = [row.get(name) for name in header]
+        marked = [repr(value).replace(".", self._decimal) if isinstance(value, float) else value for value in values]
+        return self.header or self._line(header), self._line(marked)
+
+    def append(self, header: bytes, line: bytes) -> None:
+        """Append a line, whole or not at all, after the header if the file is empty; InputError if it cannot be."""
+        try:
+            with self.path.open("a+b", buffering=0) as file:
+                self._check_end(file)
+                append_whole(file, line if file.tell() else header + line)
+        except OSError as error:
+            raise InputError.of(f"{self.path} cannot be written ({error.strerror})", fix=FULL) from error
+
+    def repair(self) -> None:
+        """Remove the half of a line that a crash left at the end."""
+        if self.path.exists():
+            content = self.path.read_bytes()
+            os.truncate(self.path, content.rfind(b"\n") + 1)
+
+    def _check_end(self, file: FileIO) -> None:
+        if file.seek(0, os.SEEK_END):
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                fix = "let one program write the table; send the row again"
+                raise InputError.of(f"another program is writing a line of {self.path}", fix=fix)
+
+    def _line(self, cells: Sequence[object]) -> bytes:
+        text = io.StringIO()
+        csv.writer(text, delimiter=self._sep, lineterminator="\n").writerow(cells)
+        return text.getvalue().encode()
 
 
 def digest(line: bytes) -> str:

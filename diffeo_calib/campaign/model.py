@@ -168,7 +168,8 @@ class CampaignModel:
         if fits:
             self.ratios.append(found.ratio)
         cause = "" if fits else self._cause(table, around.data, seen, known)
-        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause))
+        shown = self.placed.shown(table.rows([row]).parts[0])
+        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown))
         change = None if cause else self._change(around, seen, verdicts, typical)
         if change is not None:
             for number in self.window:

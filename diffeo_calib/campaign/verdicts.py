@@ -13,10 +13,10 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from math import log
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -87,10 +87,11 @@ class Verdict:
     Args:
         row: its number. fits: whether it is where the accepted rows before it predict it; None if they could not yet.
         accepted: whether it was taken in.
-        error: how far it is from its prediction, m: RMS of its numbers. expected: the same as expected.
+        error: how far it is from its prediction, m at the tool: RMS of its numbers. expected: the same as expected.
         cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
         expected_error: error of the robot over the target after this row, m; None before the first model.
         decided: whether the user accepted or rejected it.
+        shown: unit in which errors of its kind are shown, and how many of it are a metre at the tool.
     """
 
     row: int
@@ -102,14 +103,24 @@ class Verdict:
     change: Change | None = None
     expected_error: float | None = None
     decided: bool = False
+    shown: tuple[str, float] = ("mm", 1e3)
 
     def __str__(self) -> str:
         if self.fits is None:
             return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}"
-        size = f"{1e3 * self.error:.3g} mm from its prediction, {1e3 * self.expected:.2g} mm are usual"
+        unit, per_metre = self.shown
+        size = (
+            f"{per_metre * self.error:.3g} {unit} from its prediction, {per_metre * self.expected:.2g} {unit} are usual"
+        )
         how = "fits" if self.fits and self.change is None else "looks wrong"
         text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
         return text if self.change is None else f"{text}; {self.change}"
+
+    def entry(self) -> dict[str, Any]:
+        """The same for programs: lengths in mm, and the sentence."""
+        same = {name: getattr(self, name) for name in ("row", "fits", "accepted", "cause")}
+        sizes = {"error_mm": 1e3 * self.error, "usual_mm": 1e3 * self.expected}
+        return same | sizes | {"change": self.change and asdict(self.change), "text": str(self)}
 
 
 class Measure(NamedTuple):

@@ -204,6 +204,8 @@ class Rows:
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
     payload: PayloadColumn = None
+    time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
+    temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
     rotation: list[str] | None = option(
         "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
         "several tips once per --position.",
@@ -279,6 +281,15 @@ class LiveOptions:
     target: str | None = option("End when the expected error is at most this, with its unit: 0.15mm.", "LENGTH")
     stdin: bool = option(
         "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
+    )
+    listen: str | None = option(
+        "Take the same lines from a socket of this machine, 0 for any free port, and answer each: "
+        "campaign/feeds.py describes them. Addresses of other machines need --token.",
+        "[HOST:]PORT",
+    )
+    token: str = option("What a program must send first to --listen.", "TEXT", default="")
+    json_lines: bool = option(
+        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
     )
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")

@@ -97,7 +97,8 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
         marker = "" if outlier.marker is None else f", marker {outlier.marker}"
         marker = marker if outlier.tip is None else f", {plain(outlier.tip)}"
         weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
-        yield f"  row {outlier.number}{marker}: {1e3 * outlier.distance:.3f} mm off{weight}; {outlier.reason}"
+        size, unit = outlier.shown
+        yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 

@@ -26,7 +26,7 @@ from diffeo_calib.common.files import IMAGE_SUFFIXES, check_writable, write_whol
 if TYPE_CHECKING:
     from diffeo_calib.sensors.errors import Evaluation
 
-VERSION = 1
+VERSION = 2
 """Of the format. Entries may be added to one version; none is removed or changes its meaning."""
 FORMAT = "diffeo_calib result"
 OPTION = "--json"
@@ -115,12 +115,12 @@ def _is_result(path: Path) -> bool:
 
 
 NAMES = "rms", "median", "p95", "max"
-READINGS = "readings"
-"""As in kinematics/errors.py, which loads torch."""
+ERRORS = "errors"
+"""As in sensors/errors.py, which loads torch."""
 
 
 def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:
-    """Errors of positions in m, and of orientations in degrees (null without), over some rows."""
+    """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
     entry: dict[str, float | int | None] = {"rows": errors.count}
     entry |= {f"{name}_m": getattr(errors, name) for name in NAMES}
     return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
@@ -134,30 +134,19 @@ def kind_entry(errors: Evaluation) -> dict[str, object]:
     return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
 
 
-def reading_entry(errors: Evaluation) -> dict[str, object]:
-    """Errors of readings alone."""
-    return {name: value for name, value in kind_entry(errors).items() if name in ("rows", "unit", *NAMES)}
-
-
 def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors as ``kinds``; those in m (``errors``) and those of readings (``reading_errors``) once more by themselves.
+    """Errors of every kind of rows as ``kinds``; those of measured positions once more as ``errors``, in m.
 
     Args:
         found: kind -> errors, or errors by rows and by stage.
     """
-    metres, readings = dict[str, Any](), dict[str, Any]()
-    for kind, own in found.items():
+    entries: dict[str, Any] = {"kinds": _each(found, kind_entry), "errors": {}}
+    for own in found.values():
         one: Any = own
         while isinstance(one, Mapping):
             one = next(iter(one.values()))
-        (readings if one.what == READINGS else metres)[kind] = own
-    entries: dict[str, Any] = {"kinds": _each(found, kind_entry)}
-    first, *others = metres.values() if metres else ({},)
-    entries["errors"] = _each(first, errors_entry)
-    for own in others:
-        entries["errors"]["in_sockets"] = _each(own, errors_entry)
-    for own in list(readings.values())[:1]:
-        entries["reading_errors"] = _each(own, reading_entry)
+        if one.what == ERRORS:
+            entries["errors"] = _each(own, errors_entry)
     return entries
 
 

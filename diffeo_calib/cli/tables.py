@@ -47,7 +47,7 @@ def table_format(units: Units) -> TableFormat:
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with the columns of rotations, deviations and payloads; the lever is in the unit of length.
+    """The same format with the columns of rotations, deviations, payloads and covariates; lever in the unit of length.
 
     Raises:
         InputError: a lever or a camera on the tool without a rotation.
@@ -66,6 +66,8 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
         payload=rows.payload,
+        time=rows.time,
+        temperature=rows.temperature,
     )
 
 

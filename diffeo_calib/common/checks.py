@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.autograd import forward_ad
 
 from diffeo_calib.common.data_frames import ARRAY_KINDS, real_array
 from diffeo_calib.common.device import outside_inference_mode
@@ -163,14 +164,21 @@ def check_seed(seed: object, what: str = "`seed`") -> int:
     return int(seed)
 
 
-def wrapped(tensor: Tensor) -> bool:
-    """Whether code must not branch on the values of ``tensor``.
+def wrapped(*tensors: Tensor) -> bool:
+    """Whether code must not branch on the values of ``tensors``.
 
-    This is so inside a ``torch.func`` transform, and while ``torch.compile``, ``torch.export`` or ``torch.jit.trace``
-    record a program. Checks of values are left out there: a recorded program does not check its input.
+    This is so inside a ``torch.func`` transform, where tensors have forward-mode tangents, and while ``torch.compile``,
+    ``torch.export`` or ``torch.jit.trace`` record a program. Checks of values are left out there: a recorded program
+    does not check its input.
     """
     recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
-    return recorded or is_functorch_wrapped_tensor(tensor)
+    return recorded or any(map(is_functorch_wrapped_tensor, tensors)) or _has_tangent(tensors)
+
+
+def _has_tangent(tensors: Sequence[Tensor]) -> bool:
+    """Whether forward-mode derivatives follow a tensor; looking takes a microsecond where there are some."""
+    level = forward_ad._current_level  # pyright: ignore[reportPrivateUsage]
+    return level >= 0 and any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:

@@ -368,7 +368,7 @@ class FittedMap:
                 fix = "calibrate again: files of this version keep what was measured"
                 raise InputError.of("the file of this model does not say what was measured", fix=fix)
             return self.y
-        values, seen = self.geodesic(self.x), self.noise.visible
+        values, seen = self.fitted_points, self.noise.visible
         if self.y is not None:
             return torch.where(seen, self.y, values)
         residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
@@ -380,7 +380,7 @@ class FittedMap:
         if self.slopes is None:
             return torch.eye(self.m, dtype=y.dtype, device=y.device).expand(len(y), -1, -1), y
         residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
-        return self.slopes, (self.slopes @ self.geodesic(self.x)[:, :, None])[:, :, 0] + residual
+        return self.slopes, (self.slopes @ self.fitted_points[:, :, None])[:, :, 0] + residual
 
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - h(k1)) at the optimum: (N, r), zero where nothing was measured."""

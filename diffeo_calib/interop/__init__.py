@@ -5,8 +5,9 @@ Names are loaded when they are first used, as those of the package.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from diffeo_calib.common.lazy import lazy_names
 
 if TYPE_CHECKING:
     from diffeo_calib.interop.c_source import CFiles, write_c
@@ -48,40 +49,18 @@ __all__ = [
     "write_urdf",
 ]
 
-_MODULE_OF = {
-    "CFiles": "c_source",
-    "CorrectionTable": "joint_tables",
-    "DHTable": "dh",
-    "DiffeoRegressor": "sklearn",
-    "JointOffsets": "rigid",
-    "NumpyKinematics": "numpy_model",
-    "RigidKinematics": "rigid",
-    "TorchProgram": "torch_program",
-    "best_joint_offsets": "rigid",
-    "correction_tables": "joint_tables",
-    "dh_table": "dh",
-    "export_onnx": "torch_program",
-    "export_torch": "torch_program",
-    "load_numpy": "numpy_model",
-    "rigid_kinematics": "rigid",
-    "write_c": "c_source",
-    "write_correction_tables": "joint_tables",
-    "write_dh": "dh",
-    "write_joint_offsets": "joint_tables",
-    "write_ur_kinematics": "ur_kinematics",
-    "write_urdf": "urdf",
-}
-"""The module that defines each name."""
-
-
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
-
-    def __getattr__(name: str) -> object:
-        """Load a name when it is first used."""
-        if name not in _MODULE_OF:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULE_OF})
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "c_source": "CFiles write_c",
+            "dh": "DHTable dh_table write_dh",
+            "joint_tables": "CorrectionTable correction_tables write_correction_tables write_joint_offsets",
+            "numpy_model": "NumpyKinematics load_numpy",
+            "rigid": "JointOffsets RigidKinematics best_joint_offsets rigid_kinematics",
+            "sklearn": "DiffeoRegressor",
+            "torch_program": "TorchProgram export_onnx export_torch",
+            "ur_kinematics": "write_ur_kinematics",
+            "urdf": "write_urdf",
+        },
+    )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from math import inf, isinf
+from typing import Any
 
 import numpy as np
 
@@ -18,81 +17,41 @@ LANES = 16
 """Controls per block: inner loops of constant length, which compilers turn into vector instructions."""
 
 
-@dataclass(frozen=True, eq=False)
-class TermConstants:
+def flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]:
+    """A flow that does not vanish; ``name``: beginning of its C functions' names, ``title``: what it does."""
+    return {
+        "name": name,
+        "title": title,
+        "size": flow.size,
+        "steps": flow.steps,
+        "stages": len(flow.weights),
+        "coefficients": flow.coefficients / flow.steps,
+        "weights": flow.weights / flow.steps,
+        "terms": [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)],
+        "tables": None if flow.tables is None else _table_constants(flow.tables),
+    }
+
+
+def _term_constants(name: str, term: RadialTerm) -> dict[str, Any]:
     """A term whose controls come in blocks, without the components that it does not move.
 
-    Args:
-        name: of its C function. term: the term.
+    ``outputs`` are the components that it moves. ``width``: components of a weight, an even number if they are
+    several, since vector registers hold pairs. ``features``: (S, blocks, D, LANES), ``weights``: (S, blocks, LANES,
+    width). ``constant``: sum of s^2 over the circles; half the squared distance is that minus a product of features.
     """
-
-    name: str
-    term: RadialTerm
-
-    @property
-    def profile(self) -> str:
-        """Name of kappa, and of its C function."""
-        return self.term.profile
-
-    @property
-    def inputs(self) -> list[int]:
-        """Columns of x: those on lines, then those on circles."""
-        return [*self.term.lines, *self.term.circles]
-
-    @property
-    def lines(self) -> int:
-        """Number of columns on lines."""
-        return len(self.term.lines)
-
-    @property
-    def circles(self) -> int:
-        """Number of columns on circles."""
-        return len(self.term.circles)
-
-    @property
-    def scales(self) -> Array:
-        """Inverse length scales of the inputs."""
-        return self.term.scales
-
-    @cached_property
-    def centre(self) -> Array:
-        """Of the controls on the lines: differences of far points would lose digits."""
-        return self.term.controls[..., list(self.term.lines)].mean(axis=(0, 1))
-
-    @property
-    def constant(self) -> float:
-        """Sum of s^2 over the circles: half the squared distance is that minus a product of features."""
-        return float((self._circle_scales**2).sum())
-
-    @cached_property
-    def outputs(self) -> np.ndarray:
-        """Components that the term moves."""
-        return np.flatnonzero(self.term.weights.any(axis=(0, 1)))
-
-    @property
-    def width(self) -> int:
-        """Components of a weight: an even number, if they are several, since vector registers hold pairs."""
-        return len(self.outputs) + (len(self.outputs) % 2 if len(self.outputs) > 1 else 0)
-
-    @cached_property
-    def features(self) -> Array:
-        """(S, blocks, D, LANES): lines from the centre, then cosine and sine of every circle."""
-        controls, scales = self.term.controls, self._circle_scales
-        straight = (controls[..., list(self.term.lines)] - self.centre) * self.scales[: self.lines]
-        angles = controls[..., list(self.term.circles)]
-        turning = np.stack([np.cos(angles) * scales, np.sin(angles) * scales], axis=-1)  # (S, C, circles, 2)
-        both = [straight, turning.reshape(*angles.shape[:2], 2 * self.circles)]
-        return _blocks(np.concatenate(both, axis=-1)).swapaxes(2, 3)
-
-    @cached_property
-    def weights(self) -> Array:
-        """(S, blocks, LANES, width)."""
-        missing = self.width - len(self.outputs)
-        return _blocks(np.pad(self.term.weights[..., self.outputs], ((0, 0), (0, 0), (0, missing))))
-
-    @property
-    def _circle_scales(self) -> Array:
-        return self.scales[self.lines :]
+    outputs = np.flatnonzero(term.weights.any(axis=(0, 1)))
+    width = len(outputs) + (len(outputs) % 2 if len(outputs) > 1 else 0)
+    weights = np.pad(term.weights[..., outputs], ((0, 0), (0, 0), (0, width - len(outputs))))
+    return {
+        "name": name,
+        "term": term,
+        "inputs": [*term.lines, *term.circles],
+        "outputs": outputs,
+        "width": width,
+        "features": _blocks(term.features).swapaxes(2, 3),
+        "weights": _blocks(weights),
+        "constant": float((term.scales[len(term.lines) :] ** 2).sum()),
+    }
 
 
 def _blocks(values: Array) -> Array:
@@ -101,128 +60,38 @@ def _blocks(values: Array) -> Array:
     return np.pad(values, ((0, 0), (0, missing), (0, 0))).reshape(len(values), -1, LANES, values.shape[2])
 
 
-@dataclass(frozen=True, eq=False)
-class TableConstants:
-    """Tables of all stages and joints, one after the other.
+def _table_constants(tables: JointTables) -> dict[str, Any]:
+    """Tables of all stages and joints, one after the other: knots (rows,) rad, and f, f', f'' (rows, 3) there.
 
-    Args:
-        tables: of a flow.
+    ``first`` is the first row of every table, stage by stage, and the number of rows.
     """
-
-    tables: JointTables
-
-    @property
-    def joints(self) -> Sequence[int]:
-        """Numbers of the tabulated joints."""
-        return self.tables.joints
-
-    @property
-    def first(self) -> list[int]:
-        """First row of every table, stage by stage, and the number of rows."""
-        lengths = [len(table.knots) for stage in self.tables.stages for table in stage]
-        return [0, *np.cumsum(lengths).tolist()]
-
-    @cached_property
-    def knots(self) -> Array:
-        """(rows,) rad."""
-        return np.concatenate([table.knots for stage in self.tables.stages for table in stage])
-
-    @property
-    def derivatives(self) -> Array:
-        """(rows, 3) f, f', f''."""
-        return np.concatenate([table.values for stage in self.tables.stages for table in stage])
+    every = [table for stage in tables.stages for table in stage]
+    return {
+        "joints": tables.joints,
+        "first": [0, *np.cumsum([len(table.knots) for table in every]).tolist()],
+        "knots": np.concatenate([table.knots for table in every]),
+        "derivatives": np.concatenate([table.values for table in every]),
+    }
 
 
-@dataclass(frozen=True, eq=False)
-class FlowConstants:
-    """A flow that does not vanish.
-
-    Args:
-        name: beginning of its C functions' names. title: what it does. flow: the flow.
-    """
-
-    name: str
-    title: str
-    flow: RecordedFlow
-
-    @property
-    def size(self) -> int:
-        """Components of a point."""
-        return self.flow.size
-
-    @property
-    def steps(self) -> int:
-        """Number of equal Runge-Kutta steps."""
-        return self.flow.steps
-
-    @property
-    def stages(self) -> int:
-        """Stages per step."""
-        return len(self.flow.weights)
-
-    @property
-    def coefficients(self) -> Array:
-        """Runge-Kutta coefficients times the length of a step."""
-        return self.flow.coefficients / self.steps
-
-    @property
-    def weights(self) -> Array:
-        """Runge-Kutta weights times the length of a step."""
-        return self.flow.weights / self.steps
-
-    @cached_property
-    def terms(self) -> list[TermConstants]:
-        """Sums over the controls."""
-        return [TermConstants(f"{self.name}_term{k}", term) for k, term in enumerate(self.flow.terms, 1)]
-
-    @cached_property
-    def tables(self) -> TableConstants | None:
-        """Functions of single joints; None without."""
-        return None if self.flow.tables is None else TableConstants(self.flow.tables)
-
-
-@dataclass(frozen=True, eq=False)
-class SagConstants:
+def sag_constants(chain: CalibratedChain, sag: Sag) -> dict[str, Any]:
     """Gravity sag with moments as sums of o_f x c_f, in place of the matrix W of blocks -[c_f]x.
 
-    Args:
-        chain: the chain. sag: its sag.
+    ``masses``: (K, F, 3) c. ``moved``: (F, n_all) 1 where joint l moves place f as seen from the ground. ``shifts``:
+    (K,) whether the coordinate shifts its joint, or turns it, along or about ``directions`` (K, 3).
     """
-
-    chain: CalibratedChain
-    sag: Sag
-
-    @property
-    def count(self) -> int:
-        """Number K of coordinates."""
-        return len(self.sag.joints)
-
-    @property
-    def masses(self) -> Array:
-        """(K, F, 3) c."""
-        W = self.sag.moments.reshape(self.count, 3, len(self.sag.offsets), 3)
-        return -np.stack([W[:, 2, :, 1], W[:, 0, :, 2], W[:, 1, :, 0]], axis=-1)
-
-    @property
-    def moved(self) -> np.ndarray:
-        """(F, n_all) 1 where joint l moves place f as seen from the ground."""
-        return (self.sag.moved != 0) * 1
-
-    @property
-    def shifts(self) -> np.ndarray:
-        """(K,) whether the coordinate shifts its joint, or turns it."""
-        return np.any(self._directions[:, 0], axis=1)
-
-    @property
-    def directions(self) -> Array:
-        """(K, 3) of the shift, or the axis of the turn."""
-        return np.where(self.shifts[:, None], self._directions[:, 0], self._directions[:, 1])
-
-    @property
-    def _directions(self) -> Array:
-        """(K, 2, 3) shift and rotation vector of the coordinate's own joint."""
-        blocks = self.sag.directions.reshape(self.count, len(self.chain.axes), 2, 3)
-        return blocks[np.arange(self.count), self.sag.joints]
+    count = len(sag.joints)
+    W = sag.moments.reshape(count, 3, len(sag.offsets), 3)
+    own = sag.directions.reshape(count, len(chain.axes), 2, 3)[np.arange(count), sag.joints]  # shift, rotation vector
+    shifts = np.any(own[:, 0], axis=1)
+    return {
+        "sag": sag,
+        "count": count,
+        "masses": -np.stack([W[:, 2, :, 1], W[:, 0, :, 2], W[:, 1, :, 0]], axis=-1),
+        "moved": (sag.moved != 0) * 1,
+        "shifts": shifts,
+        "directions": np.where(shifts[:, None], own[:, 0], own[:, 1]),
+    }
 
 
 WIDTH = 120

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from math import isinf
 from os import PathLike
@@ -20,9 +19,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
-from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants, array, number, pose, poses
+from diffeo_calib.interop.c_constants import LANES, array, flow_constants, number, pose, poses, sag_constants
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.provenance import package_version
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.program import TOOL_LEVER, Program, inverse, tool_points
@@ -168,7 +168,7 @@ def _texts(program: Program, settings: Settings, stem: str, prefix: str) -> dict
         "macro": prefix.upper(),
         "n": program.chain.n,
         "markers": len(program.markers),
-        "generated": f"{GENERATED} {_version()}",
+        "generated": f"{GENERATED} {package_version()}",
         "robot": _comment(settings.robot),
         "joints": [_comment(line) for line in settings.joints],
         "frame_name": settings.frame_name,
@@ -178,7 +178,7 @@ def _texts(program: Program, settings: Settings, stem: str, prefix: str) -> dict
 
 def _constants(program: Program, settings: Settings) -> dict[str, Any]:
     chain, flows = program.chain, _flows(program)
-    terms = [term for flow in flows for term in flow.terms]
+    terms = [term for flow in flows for term in flow["terms"]]
     coupled = not np.array_equal(chain.coupling, np.eye(len(chain.axes))) or bool(chain.coupling_offset.any())
     return {
         "lanes": LANES,
@@ -188,16 +188,16 @@ def _constants(program: Program, settings: Settings) -> dict[str, Any]:
         "groups": [(tip, *run) for tip, run in _runs(program.on)],
         "program_tip": program.tip,
         "flows": flows,
-        "flow_names": [flow.name for flow in flows],
-        "profiles": sorted({term.profile for term in terms}),
-        "widths": sorted({term.width for term in terms}),
-        "tabulated": any(flow.tables for flow in flows),
+        "flow_names": [flow["name"] for flow in flows],
+        "profiles": sorted({term["term"].profile for term in terms}),
+        "widths": sorted({term["width"] for term in terms}),
+        "tabulated": any(flow["tables"] for flow in flows),
         "chain": chain,
         "waves": chain.waves,
         "moving": len(chain.axes),
         "slides": not chain.revolute.all(),
         "coupled": coupled,
-        "sag": None if chain.sag is None else SagConstants(chain, chain.sag),
+        "sag": None if chain.sag is None else sag_constants(chain, chain.sag),
         "markers_in_flange": program.markers,
         "tool_points": tool_points(settings.tool, TOOL_LEVER),
         "framed": not np.array_equal(settings.frame, np.eye(4)),
@@ -215,10 +215,12 @@ def _runs(on: Sequence[int]) -> Iterator[tuple[int, tuple[int, int]]]:
         first += count
 
 
-def _flows(program: Program) -> list[FlowConstants]:
-    joint = FlowConstants("joint", "phi^-1: corrections of the joints", program.joint_flow)
-    task = FlowConstants("task", "psi: corrections of positions", program.task_flow)
-    return [constants for constants in (joint, task) if not constants.flow.vanishes]
+def _flows(program: Program) -> list[dict[str, Any]]:
+    named = (
+        ("joint", "phi^-1: corrections of the joints", program.joint_flow),
+        ("task", "psi: corrections of positions", program.task_flow),
+    )
+    return [flow_constants(*flow) for flow in named if not flow[2].vanishes]
 
 
 def _settings(model: CalibratedKinematics, program: Program, tool: object, frame: str) -> Settings:
@@ -273,13 +275,6 @@ def _prefix(stem: str, given: str | None) -> str:
         expected = "letters, digits and _ that begin with a letter"
         raise InputError.of("the prefix of names in C", expected=expected, got=as_written(name), fix="pass `prefix`")
     return name
-
-
-def _version() -> str:
-    try:
-        return version(PACKAGE)
-    except PackageNotFoundError:  # copied instead of installed
-        return "(unknown version)"
 
 
 def _comment(text: str) -> str:

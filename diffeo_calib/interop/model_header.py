@@ -196,7 +196,7 @@ def rebuild(
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
-        summary = Summary.from_dict(header["report"]) if header["report"] else None
+        summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
         given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
         given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "scales": tensors.get(SCALES)}
         given["ball"] = header.get("ball", False) is True

@@ -48,11 +48,10 @@ class KernelSum(nn.Module):
         super().__init__()
         self.profile = PROFILES[term.profile]
         self.lines, self.circles = list(term.lines), list(term.circles)
-        controls = constant(term.controls)
         self.register_buffer("scales", constant(term.scales))
-        self.register_buffer("centre", controls[..., self.lines].mean((0, 1)))
+        self.register_buffer("centre", constant(term.centre))
         self.register_buffer("weights", constant(term.weights))
-        features = self.lift(controls)  # (S, C, D)
+        features = constant(term.features)  # (S, C, D)
         squares = features.square().sum(-1, keepdim=True)
         right = torch.cat([-2.0 * features, torch.ones_like(squares), squares], -1)
         self.register_buffer("right", right.mT.contiguous())  # (S, D + 2, C)

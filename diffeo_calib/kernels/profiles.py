@@ -25,7 +25,11 @@ MAX_ORDER = 3
 
 
 class Profile(ABC):
-    """kappa: [0, inf) -> R with kappa(0) = 1."""
+    """kappa: [0, inf) -> R with kappa(0) = 1.
+
+    Profiles of your own work with every backend. Sums are compiled where they use ``exp``, ``sqrt``, ``relu``,
+    arithmetic and numbers, and run on tensors else. A tensor that is to be optimised must be an attribute.
+    """
 
     @property
     @abstractmethod
@@ -47,9 +51,15 @@ class Profile(ABC):
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, kappa', ..., kappa^(order)], differentiable by autograd when r2 is a tensor."""
-        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)):
+        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)) and not self.followed:
             return [_derivative(r2, self, k) for k in range(order + 1)]
         return [self.derivative(r2, k) for k in range(order + 1)]
+
+    @property
+    def followed(self) -> bool:
+        """Whether autograd follows a parameter of the profile: an attribute that is a tensor."""
+        values = vars(self).values()
+        return torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
 
 
 class _Derivative(torch.autograd.Function):

@@ -279,7 +279,7 @@ class CalibratedKinematics:
             "measured": measured_words(self),
             "rows of the fit": len(self.configurations),
         }
-        if found is not None:
+        if found is not None and found.geometry_rms is not None and found.leave_one_out_rms is not None:
             facts["geometric calibration, RMS"] = f"{1e3 * found.geometry_rms:.4f} mm on the rows of the fit"
             facts["calibrated, RMS"] = f"{1e3 * found.leave_one_out_rms:.4f} mm, each row predicted by all others"
         if self.registration is not None:

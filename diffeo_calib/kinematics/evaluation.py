@@ -6,10 +6,9 @@ whether errors are too large to be those of a calibrated robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import chain, count
 from math import degrees, inf, radians
 from typing import Any
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.rows import RowGroups
@@ -85,17 +84,11 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
         InputError: another number of joints or markers, or poses on one side and points on the other.
         MeasurementError: readings of devices that ``places`` does not know.
     """
-    kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
-    for table, rows in rows_of_one_kind(data):
-        name = next(name for name in _names(table.kind) if name not in kinds)
-        kinds[name] = sensor_of(table).errors(table, _predicted(kinematics, table), places)
-        index[name] = rows
-    return Evaluations(kinds, index, len(data), places.found, places.numbers)
-
-
-def _names(kind: str) -> Iterator[str]:
-    """Of rows of one kind, of which a table may have several: distance, distance 2, ..."""
-    return chain([kind], (f"{kind} {number}" for number in count(2)))
+    found = [
+        (sensor_of(table).errors(table, _predicted(kinematics, table), places), rows)
+        for table, rows in rows_of_one_kind(data)
+    ]
+    return Evaluations.of(found, len(data), places.found, places.numbers)
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
@@ -259,18 +252,6 @@ def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
     found = OutsideRange(model)
     found.add(q)
     found.warn()
-
-
-def check_plausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
-    """Warn of errors so large that the measurements were probably read in another way than they were written.
-
-    Raises MeasurementError for errors that say nothing about the robot; arguments as of :func:`implausible`.
-    """
-    text = implausible(model, data, errors)
-    if text is not None and impossible(model, errors):
-        raise MeasurementError(text)
-    if text is not None:
-        warn_user(text)
 
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,17 +73,19 @@ class GeometryMap(NominalMap):
 
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
         """The same parameters around another geometry of the same chain."""
-        return GeometryMap(geometry, elastic=self.elasticity is not None, waves=self.waves, payload=self.payload)
+        return self._with(geometry=geometry)
 
     def with_waves(self, waves: GearWaves) -> GeometryMap:
         """The same map with other waves, whose coefficients are the last parameters."""
-        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=waves, payload=self.payload)
+        return self._with(waves=waves)
 
     def with_payload(self, load: Payload | None) -> GeometryMap:
         """The same map with other masses of its payload."""
-        if load is self.load:
-            return self
-        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=self.waves, payload=load or None)
+        return self if load is self.load else self._with(payload=load or None)
+
+    def _with(self, **changes: Any) -> GeometryMap:
+        own = {"geometry": self.geometry, "waves": self.waves, "payload": self.payload}
+        return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
         """Another nominal map under the payloads of the rows of this one."""

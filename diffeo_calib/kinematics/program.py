@@ -17,7 +17,7 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.runtime.arrays import Array
-from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
+from diffeo_calib.runtime.build import calibrated_chain, recorded_flow
 from diffeo_calib.runtime.chain import waves_of
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
@@ -60,7 +60,7 @@ def _program(deformation: Deformation) -> Program | None:
         return None
     geometry, (errors, coefficients) = nominal.geometry, nominal.split(theta)
     chain = calibrated_chain(
-        nominal_chain(geometry.chain.to_config()),
+        geometry.chain.arrays,
         _array(geometry.base),
         _array(geometry.joint_errors),
         _array(errors),

@@ -48,7 +48,7 @@ class Provenance:
         check_note(note)
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
         table = "" if measurements.origin is None else measurements.origin.options
-        return cls(date, _version(), measurements.sha256, note, table=table)
+        return cls(date, package_version(), measurements.sha256, note, table=table)
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any]) -> Provenance:
@@ -88,7 +88,8 @@ def check_note(note: object) -> None:
         raise InputError.of("`note`", expected=f"at most {LONGEST_NOTE} characters", got=len(note), fix=fix)
 
 
-def _version() -> str:
+def package_version() -> str:
+    """Version of this package."""
     try:
         return version(PACKAGE)
     except PackageNotFoundError:  # copied instead of installed
@@ -111,8 +112,9 @@ ENTRIES: dict[str, tuple[str, type]] = {
     "effective_parameters": ("effective parameters", float),
 }
 """Field of a summary -> its name in dictionaries and model files, and its type."""
-OPTIONAL = ("noise_degrees_of_freedom", "effective_parameters")
-"""Fields that may be None: they have no entry then. The first model files did not have them."""
+OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
+OPTIONAL = (*OF_POSITIONS, "noise_degrees_of_freedom", "effective_parameters")
+"""Fields that may be None: they have no entry then. The first model files did not have the last two."""
 LENGTH_UNIT = " [m]"
 """Ends the names of the parts' entries."""
 INFINITE = "infinite"
@@ -121,7 +123,7 @@ INFINITE = "infinite"
 
 @dataclass(frozen=True)
 class Summary:
-    """Results of a calibration, in SI units.
+    """Results of a calibration, in SI units. Errors are those of measured positions: None where none was measured.
 
     Args:
         registration_rms: RMS distance of the training rows from the nominal robot after registration, m.
@@ -140,10 +142,10 @@ class Summary:
         effective_parameters: effective number of parameters of the fit; None if it was not computed.
     """
 
-    registration_rms: float
-    geometry_rms: float
-    diffeomorphic_rms: float
-    leave_one_out_rms: float
+    registration_rms: float | None
+    geometry_rms: float | None
+    diffeomorphic_rms: float | None
+    leave_one_out_rms: float | None
     outliers: int
     coupling_residual: float
     end_residual: float
@@ -167,14 +169,18 @@ class Summary:
         return values
 
     @classmethod
-    def from_dict(cls, entries: Mapping[str, Any]) -> Summary:
+    def from_dict(cls, entries: Mapping[str, Any], *, positions: bool = True) -> Summary:
         """The inverse of :meth:`to_dict`.
+
+        Args:
+            entries: of a file. positions: whether any was measured: old files have errors of other rows in their place.
 
         Raises:
             InputError: an entry is missing or unknown, or its value has another type.
         """
         known = {name for name, _ in ENTRIES.values()}
         values = {field: _value(entries, field) for field in ENTRIES}
+        values |= {} if positions else dict.fromkeys(OF_POSITIONS)
         parts = {}
         for name, value in entries.items():
             if name not in known:

@@ -27,7 +27,8 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
+from diffeo_calib.runtime import program
+from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER, Program
 
 LONGEST_TOOL = 1e3
 """m; beyond it the three points of a tool lose digits."""
@@ -70,19 +71,15 @@ class ToolKinematics:
     def poses(self, q: Tensor) -> Tensor:
         """(N, n) rad or m -> (N, 4, 4) m; detached outside of torch.func transforms."""
         q = q if wrapped(q) else q.detach()
-        program = program_of(self.fitted.deformation) if takes_program(q) else None
-        if program is not None:
-            return torch.from_numpy(program.at(self.tip).poses(q.numpy(), self.tool.numpy(), self.frame))
+        if (known := self._program_for(q)) is not None:
+            return torch.from_numpy(known.poses(q.numpy(), self.tool.numpy(), self.frame))
         return self._in_frame(poses_from_marks(self.deformation(q).unflatten(1, (3, 3)), TOOL_LEVER))
 
     def jacobian(self, q: Tensor) -> Tensor:
         """(N, 6, n): linear velocity of the TCP [m/rad or m/m], then angular velocity, about the axes of the frame."""
         q = q if wrapped(q) else q.detach()
-        program = program_of(self.fitted.deformation) if takes_program(q) else None
-        if program is not None:
-            return torch.from_numpy(
-                program.at(self.tip).poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1]
-            )
+        if (known := self._program_for(q)) is not None:
+            return torch.from_numpy(known.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])
         points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
         return self._turned() @ pose_slopes(points, slopes)
 
@@ -107,6 +104,11 @@ class ToolKinematics:
             covariance = self.fitted.covariance_at(at, directions)
             blocks.append(self.fitted.with_open_directions(covariance, sensitivity, directions))
         return torch.cat(poses), torch.cat(blocks)
+
+    def _program_for(self, q: Tensor) -> Program | None:
+        """The constants that answer a query; None where torch must."""
+        known = program_of(self.fitted.deformation) if takes_program(q) else None
+        return None if known is None else known.at(self.tip)
 
     def _without_base(self, sensitivity: Tensor) -> Tensor:
         kept = sensitivity.new_ones(sensitivity.shape[2])
@@ -158,33 +160,14 @@ def tool_points(tool: Tensor, lever: float = TOOL_LEVER) -> Tensor:
 
 
 def pose_slopes(points: Tensor, slopes: Tensor, lever: float = TOOL_LEVER) -> Tensor:
-    """Derivative of the pose that fits three points best (poses_from_marks), exact also where they are not rigid.
-
-    With S = sum_k (p_k - c) u_k^T = R P, R the rotation and P symmetric, a change dS turns R by R exp([b]x),
-
-        (tr(P) 1 - P) b = axial(R^T dS - dS^T R).
+    """Derivatives (N, 6, n) of the poses that fit three points best, see :func:`program.pose_slopes`.
 
     Args:
-        points: (N, 3, 3) the three points, one per row, m.
-        slopes: (N, 3, 3, n) their derivatives by n parameters.
-        lever: distance of the points from the frame's origin, m.
-
-    Returns:
-        (N, 6, n): linear velocity of the origin, then angular velocity, about the axes of the points' frame.
+        points: (N, 3, 3) m. slopes: (N, 3, 3, n). lever: distance of the points from the frame's origin, m.
     """
-    directions = marks(points.device)
-    centre = points.mean(1)
-    S = (points - centre[:, None]).mT @ directions  # (N, 3, 3)
-    R = poses_from_marks(points, lever)[:, :3, :3]
-    P = R.mT @ S
-    dS = torch.einsum("nkcj,kd->njcd", slopes - slopes.mean(1, keepdim=True), directions)  # (N, n, 3, 3)
-    A = R.mT[:, None] @ dS
-    skewed = A - A.mT
-    axial = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], -1)  # (N, n, 3)
-    one = torch.eye(3, dtype=P.dtype, device=P.device)
-    turning = P.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * one - P
-    body = torch.linalg.solve(turning, axial.mT)  # (N, 3, n)
-    return torch.cat([slopes.mean(1), R @ body], dim=1)
+    one = torch.eye(3, dtype=points.dtype, device=points.device)
+    use = torch, marks(points.device), one
+    return program.pose_slopes(points, slopes, poses_from_marks(points, lever)[:, :3, :3], use)
 
 
 REFERENCE_ROWS = 40

@@ -207,6 +207,13 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
     return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
 
 
+def covariates(given: Mapping[str, object], q: Tensor) -> dict[str, object]:
+    """Attributes of a table for columns (N,) by name beside its configurations (N, n); None for those not known."""
+    fix, known = "pass a finite number for each row", {name: own for name, own in given.items() if own is not None}
+    found = [copied(values, name, (len(q),), fix=fix).to(q.device) for name, values in known.items()]
+    return {"covariates": torch.stack(found, 1) if found else None, "covariate_names": tuple(known)}
+
+
 def payloads(value: object, q: Tensor) -> Tensor:
     """Masses (N,), one for each of the rows q (N, n), given so or as one for all."""
     fix = "pass one mass for all rows, or one for each"

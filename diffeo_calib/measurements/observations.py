@@ -15,7 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, payloads
+from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, covariates, payloads
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,
     RANGES,
@@ -25,6 +25,7 @@ from diffeo_calib.measurements.rows import (
     common,
     joint_ranges,
     set_attributes,
+    with_attributes,
 )
 
 WITH_POSITION = ("position", "pose", "mixture")
@@ -89,6 +90,17 @@ class Observations(RowGroups):
     def payload_at(self) -> str | None:
         """Name of the link that carried the payloads; None for the robot's tip."""
         return self.parts[0].payload_at
+
+    @property
+    def covariate_names(self) -> tuple[str, ...]:
+        """Names of the columns of ``covariates``."""
+        return self.parts[0].covariate_names
+
+    @property
+    def covariates(self) -> Tensor | None:
+        """(N, K) values with which something may drift; None without any."""
+        own = [part.covariates for part in self.parts]
+        return None if own[0] is None else self._whole(own)
 
     @property
     def lines(self) -> Tensor:
@@ -226,6 +238,16 @@ class Observations(RowGroups):
         own = [None if masses is None else masses[rows.to(masses.device)] for rows in self.index]
         return Observations([part.with_payload(m, at) for part, m in zip(self.parts, own, strict=True)], self.index)
 
+    def with_covariates(self, *, time: object = None, temperature: object = None) -> Observations:
+        """Return the same rows with columns with which something may drift: :meth:`Measurements.with_covariates`."""
+        found = covariates({"time": time, "temperature": temperature}, self.q)
+        parts = []
+        for part, rows in zip(self.parts, self.index, strict=True):
+            own = found["covariates"]
+            own = own[rows.to(own.device)] if isinstance(own, Tensor) else None
+            parts.append(with_attributes(part, covariates=own, covariate_names=found["covariate_names"]))
+        return Observations(parts, self.index)
+
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Observations:
         """Return the same rows with other line numbers (N,), see :meth:`Measurements.with_line_numbers`."""
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row").to(HOST)
@@ -313,7 +335,7 @@ def unmixed(table: Any, rows: Tensor) -> list[tuple[Any, Tensor]]:
 
 def _check_joinable(tables: Sequence[Any]) -> None:
     """Raise MeasurementError for tables that differ in joints or payloads, or whose ball is on several tips."""
-    check_alike(tables, ("payload",), ("n", "joint_names", "payload_at"))
+    check_alike(tables, ("payload", "covariates"), ("n", "joint_names", "payload_at", "covariate_names"))
     tips = {tip for table in tables if (tip := table.ball_tip) is not None}
     if len(tips) > 1:
         fix = "the ball in sockets and that of readings is one: pass the rows of one ball"

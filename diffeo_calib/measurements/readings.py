@@ -62,8 +62,8 @@ class Readings(RowTable):
         unit: name of the unit in which readings are shown, and how many of it are one of ``values``.
     """
 
-    BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers")
-    ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on", "unit")
+    BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
+    ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
 
     flattery = FLATTERY
 

@@ -15,7 +15,7 @@ from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, printable, warn_user
-from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, unique_names, unlikely_si_joints
+from diffeo_calib.measurements.checks import chosen_rows, copied, covariates, payloads, unique_names, unlikely_si_joints
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -282,6 +282,9 @@ class RowTable(RowGroups):
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
+    covariates: Tensor | None = None
+    """(N, K) values with which something may drift, such as times and temperatures, in any unit."""
+    covariate_names: tuple[str, ...] = ()
 
     @property
     def n(self) -> int:
@@ -353,6 +356,25 @@ class RowTable(RowGroups):
         """
         return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
+    def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
+        """Return the same rows with columns with which device or arm may drift.
+
+        A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
+        the model, which then holds for the middle of each column's range.
+
+        Args:
+            time, temperature: values (N,), in any unit; None if they are not known.
+
+        Raises:
+            MeasurementError: not one per row, or not finite.
+        """
+        return with_attributes(self, **covariates({"time": time, "temperature": temperature}, self.q))
+
+    @property
+    def drifting(self) -> dict[str, Tensor]:
+        """The covariates (N,) by name."""
+        return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
+
     def with_load(self, load: Payload) -> Self:
         """Return the same rows with the masses of a payload, if there is one."""
         return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
@@ -377,14 +399,15 @@ class RowTable(RowGroups):
     def to_frame(self) -> Any:
         """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
 
-        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, and known masses as payload.
+        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, known masses as payload, and
+        covariates.
 
         Raises:
             ImportError: pandas is not installed.
         """
         names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
         payload = {} if self.payload is None else {"payload": self.payload}
-        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload
+        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload | self.drifting
         return data_frame(columns, self.line_numbers.numpy())
 
     def measured(self) -> dict[str, Any]:

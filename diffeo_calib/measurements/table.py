@@ -96,9 +96,32 @@ class Measurements(ImageTable, SocketTable):
             Nothing is dropped.
     """
 
-    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = (
+        "q",
+        "points",
+        "poses",
+        "board",
+        "std",
+        "rotation_std",
+        "line_numbers",
+        "session",
+        "payload",
+        "socket",
+        "covariates",
+    )
     BY_ROW = (*BY_ROW, *IMAGE_COLUMNS)
-    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (
+        "joint_names",
+        "marker_names",
+        "on",
+        "lever",
+        "session_names",
+        "payload_at",
+        "covariate_names",
+        "sockets",
+        "n",
+        "markers",
+    )
     ALIKE = (*ALIKE, "camera")
 
     q: Tensor

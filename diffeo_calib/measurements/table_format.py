@@ -38,6 +38,7 @@ class TableFormat:
             frame: one for all, or a list of one or three for each frame.
         joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
         payload: name of the column with the known mass that the robot carries, in any unit.
+        time, temperature: names of columns with which something may drift, in any unit.
         camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
 
     Raises:
@@ -56,6 +57,8 @@ class TableFormat:
     rotation_std: Names | None = None
     joint_length: str | None = None
     payload: str | None = None
+    time: str | None = None
+    temperature: str | None = None
     camera_on_tool: bool = False
 
     def __post_init__(self) -> None:
@@ -75,6 +78,12 @@ class TableFormat:
             raise MeasurementError.of("`sep` and `decimal`", expected="different characters", got=got, fix=fix)
 
     @property
+    def covariates(self) -> dict[str, str]:
+        """Names of the columns with which something may drift, by what they hold."""
+        given = {"time": self.time, "temperature": self.temperature}
+        return {name: column for name, column in given.items() if column is not None}
+
+    @property
     def per_metre(self) -> float:
         """Units of length per metre."""
         return UNITS_PER_METRE[self.length]
@@ -92,7 +101,7 @@ class TableFormat:
     def joints_only(self) -> TableFormat:
         """The same units, separator and decimal mark, and payload, for a table of joint values."""
         plain = TableFormat(self.length, self.angle, self.sep, self.decimal, joint_length=self.joint_length)
-        return replace(plain, payload=self.payload)
+        return replace(plain, payload=self.payload, time=self.time, temperature=self.temperature)
 
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.

@@ -59,10 +59,6 @@ class CholeskyRegression(DataConditional):
         log_det = 2.0 * torch.diagonal(self.factor).log().sum()
         return -0.5 * (quadratic + log_det + len(self.factor) * log(2.0 * pi))
 
-    def leave_one_out(self, target: Tensor) -> Tensor:
-        """Leave-one-out errors at every configuration, [(G+R)^-1]_ii^-1 mu_i: (N, m) in m."""
-        return torch.linalg.solve(self.inverse_blocks(len(target)), self.mu(target)[:, :, None])[:, :, 0]
-
     @cached_property
     def inverse(self) -> Tensor:
         """(G + R)^-1, kept from then on: (N m, N m)."""

@@ -105,6 +105,22 @@ class Conditional(ABC):
         raise InputError.of("features of shared shifts", fix="calibrate with fewer control points (`controls=200`)")
 
 
+class FeatureConditional(Conditional):
+    """A conditional whose covariances are those of its :class:`Features`: nothing large cancels in them."""
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """Posterior covariance at the configurations of a projected linearisation: (M, r, r)."""
+        values, signs = self.features(at)
+        values = values.T.reshape(*at.sensitivity.shape[:2], -1)
+        return at.fields.own_blocks() + (values * signs) @ values.mT
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance between two linearisations, by default the same: (M m, M' m')."""
+        mine, signs = self.features(at)
+        theirs = mine if other is None else self.features(other).values
+        return at.fields.gram(None if other is None else other.fields) + (mine.T * signs) @ theirs
+
+
 class DataConditional(Conditional):
     """Conditioning with all data as control points; the unknown is mu, the momentum at time 1.
 
@@ -122,6 +138,18 @@ class DataConditional(Conditional):
     def mu(self, target: Tensor) -> Tensor:
         """(G + R)^-1 target: (N, m) -> (N, m)."""
         return self.solve(target[:, :, None])[:, :, 0]
+
+    def inverse_blocks(self, rows: int) -> Tensor:
+        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m); only where there is a factor of G + R."""
+        raise NotImplementedError
+
+    def left_out(self, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (N, m) of every configuration predicted by all others, [(G + R)^-1]_ii^-1 mu_i, and their covariance.
+
+        The covariance (N, m, m) holds the noise of the configuration itself.
+        """
+        own = torch.linalg.inv(self.inverse_blocks(len(target)))
+        return (own @ self.mu(target)[:, :, None])[:, :, 0], own
 
     def momenta(self, target: Tensor) -> Momenta:
         """mu transported back to time 0."""

@@ -34,7 +34,7 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features
+from diffeo_calib.regression.conditional import NOISE_ADVICE, FeatureConditional, Features
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
@@ -48,7 +48,7 @@ INFORMED_SHARE = 1e-9
 """Directions of the momenta about which the data say less than this share of what they say about the best known."""
 
 
-class ControlPointRegression(Conditional):
+class ControlPointRegression(FeatureConditional):
     """Factorised normal equations around a deformation.
 
     Args:
@@ -146,25 +146,12 @@ class ControlPointRegression(Conditional):
         """Number of momenta, parameters and shared shifts."""
         return len(self.core)
 
-    def posterior(self, at: Linearisation) -> Tensor:
-        """Prior minus the part that the controls can express, plus the posterior of that part: (M, r, r)."""
+    def features(self, at: Linearisation) -> Features:
+        """What the controls can express of the fields, and its posterior together with that of the parameters."""
         rows = self._rows(at)
         with large_work(rows.numel()):
             expressed = self._whiten(rows.T)  # (size, M r)
             left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
-        before, after = (part.T.reshape(*at.sensitivity.shape[:2], -1) for part in (expressed, left))
-        return at.own_blocks() - before @ before.mT + after @ after.mT
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """The same between two linearisations: (M m, M' m')."""
-        mine, theirs = (self._whiten(self._rows(points or at).T) for points in (at, other))
-        left, right = (torch.linalg.solve_triangular(self.core, part, upper=False) for part in (mine, theirs))
-        return at.gram(other) - mine.T @ theirs + left.T @ right
-
-    def features(self, at: Linearisation) -> Features:
-        """What the controls can express of the fields, and its posterior together with that of the parameters."""
-        expressed = self._whiten(self._rows(at).T)
-        left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
         return Features.of((expressed[: self._fields], -1), (left, 1))
 
     def shift_features(self) -> Tensor:

@@ -20,10 +20,10 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import DataConditional, Features
+from diffeo_calib.regression.conditional import DataConditional, FeatureConditional, Features
 
 
-class ExplicitParameterRegression(DataConditional):
+class ExplicitParameterRegression(FeatureConditional, DataConditional):
     """Conditioning by a Cholesky factor of F + R and one of the parameters' precision.
 
     Args:
@@ -56,9 +56,8 @@ class ExplicitParameterRegression(DataConditional):
         found = torch.linalg.solve_triangular(self.factor.T, white, upper=True)
         return self.dense.spread(found).view_as(values)
 
-    def inverse_blocks(self) -> Tensor:
-        """[(G + R)^-1]_ii for each of the N configurations: (N, m, m)."""
-        rows = len(self.linearisation.sensitivity)
+    def inverse_blocks(self, rows: int) -> Tensor:
+        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
         with large_work(self.factor.numel()):
             fields = self.dense.inverse_blocks(rows)
             known = torch.linalg.solve_triangular(self.factor.T, self.white, upper=True)
@@ -66,37 +65,20 @@ class ExplicitParameterRegression(DataConditional):
         known = self.dense.spread(known).unflatten(0, (rows, -1))
         return fields - known @ known.mT
 
-    def posterior(self, at: Linearisation) -> Tensor:
-        """The formula above: (M, r, r)."""
-        known, unknown = (part.reshape(*at.sensitivity.shape[:2], -1) for part in self._parts(at))
-        return at.fields.own_blocks() - known @ known.mT + unknown @ unknown.mT
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """The formula above between two linearisations: (M m, M' m')."""
-        known, unknown = self._parts(at)
-        theirs = (known, unknown) if other is None else self._parts(other)
-        fields = at.fields.gram(None if other is None else other.fields)
-        return fields - known @ theirs[0].T + unknown @ theirs[1].T
-
     def features(self, at: Linearisation) -> Features:
-        """What the data tell about the fields, and what they leave of the parameters."""
-        known, unknown = self._parts(at)
+        """What the data tell about the fields (M r, S), and what they leave of the parameters (M r, K + c)."""
+        cross = self.fields.gram(at.fields).T
+        cross = cross if self.dense.seen is None else cross[:, self.dense.seen]
+        with large_work(cross.numel()):
+            known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, S)
+        scaled = at.sensitivity.flatten(0, 1) * self.deviations
+        unknown = torch.nn.functional.pad(scaled, (0, self.shifts)) - known @ self.white  # D Lambda^-1/2
+        unknown = torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)
         return Features.of((known.T, -1), (unknown.T, 1))
 
     def shift_features(self) -> Tensor:
         """What the data leave of the shifts."""
-        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)[
-            :, len(self.core) - self.shifts :
-        ]
+        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)
+        own = own[:, len(own) - self.shifts :]
         left = torch.linalg.solve_triangular(self.core, own, upper=False)
         return torch.cat([left.new_zeros(len(self.factor), self.shifts), left])
-
-    def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
-        """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K + c)."""
-        cross = self.fields.gram(at.fields).T
-        cross = cross if self.dense.seen is None else cross[:, self.dense.seen]
-        with large_work(cross.numel()):
-            known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
-        scaled = at.sensitivity.flatten(0, 1) * self.deviations
-        unknown = torch.nn.functional.pad(scaled, (0, self.shifts)) - known @ self.white  # D Lambda^-1/2
-        return known, torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)

@@ -16,14 +16,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from queue import SimpleQueue
+from queue import Queue
 from threading import Condition, Thread
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from diffeo_calib.campaign.campaign import Campaign
+from diffeo_calib.campaign.feeds import DECISIONS, LOCAL, Sent
+from diffeo_calib.campaign.planned import Next
 from diffeo_calib.common.errors import InputError
 
-LOCAL = ("127.0.0.1", "localhost")
+PATHS = tuple(f"/{name}" for name in DECISIONS)
+SHOWN_ROWS, SHOWN_POSES = 8, 500
+"""The last rows, and poses."""
 ALIVE_SECONDS = 10.0
 """After this long without news a page is told that the campaign is alive; closed ones are noticed then."""
 HEADER = "X-Campaign"
@@ -34,13 +39,13 @@ class Page:
 
     Attributes:
         url: where the page is, with its token if it has one.
-        decisions: (row, whether it is accepted), as the buttons were pressed.
+        decisions: what the buttons decided, as programs send it.
     """
 
-    def __init__(self, server: ThreadingHTTPServer, token: str) -> None:
+    def __init__(self, server: ThreadingHTTPServer, token: str, decisions: Queue[Sent | None]) -> None:
         host, port = str(server.server_address[0]), server.server_address[1]
         self.token, self.url = token, f"http://{host}:{port}/" + (f"?token={token}" if token else "")
-        self.decisions: SimpleQueue[tuple[int, bool]] = SimpleQueue()
+        self.decisions = decisions
         self._news, self._state, self._count, self.closed = Condition(), "{}", 0, False
 
     def publish(self, state: dict[str, Any]) -> None:
@@ -69,8 +74,11 @@ class Page:
 
 
 @contextmanager
-def served(address: str) -> Iterator[Page]:
+def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
     """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
+
+    Args:
+        decisions: takes what the buttons decide.
 
     Raises:
         InputError: no such address, or one that is taken.
@@ -83,7 +91,7 @@ def served(address: str) -> Iterator[Page]:
         expected = "a free port, or HOST:PORT"
         raise InputError.of(f"the page at {address}", expected=expected, got=str(error)) from error
     server.daemon_threads = True
-    page = Page(server, "" if host in LOCAL else secrets.token_urlsafe())
+    page = Page(server, "" if host in LOCAL else secrets.token_urlsafe(), decisions)
     vars(server)["page"] = page
     thread = Thread(target=server.serve_forever, daemon=True)
     thread.start()
@@ -94,6 +102,37 @@ def served(address: str) -> Iterator[Page]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None, goal: float | None) -> dict[str, Any]:
+    """What the page shows: lengths in mm, places in m in the robot's base.
+
+    Args:
+        words: the expected error, and the next poses. found: these. goal: expected error to reach, m.
+    """
+    robot, count, known = campaign.robot, len(campaign), campaign.expected_error
+    seen = [(one.row + 1, 1e3 * one.expected_error) for one in campaign.verdicts if one.expected_error is not None]
+    steps = [] if found is None else [(count + step, 1e3 * value) for step, value in enumerate(found.expected)]
+    next_q = campaign.candidates[:0] if found is None else found.q[:1]
+    verdicts = [
+        {"row": one.row, "text": str(one), "accepted": one.accepted, "fits": one.fits}
+        for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
+    ]
+    frames = robot.joint_frames(next_q)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(1, 0, 3)
+    tips = robot.tip_poses(next_q).flatten(1, -3)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(0, 1, 3)
+    done = robot.tip_poses(campaign.table.q[-SHOWN_POSES:]).flatten(1, -3)[:, 0, :3, 3]
+    return {
+        "error": None if known is None else 1e3 * known,
+        "state": f"{len(campaign.accepted)} of {count} rows accepted; {words[0]}",
+        "pose": words[1],
+        "goal": None if goal is None else 1e3 * goal,
+        "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
+        "forecast": steps,
+        "verdicts": verdicts,
+        "done": done.tolist(),
+        "next": tips[:, 0].tolist(),
+        "links": [*frames[0].tolist(), *tips[:, 0].tolist()],
+    }
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -121,15 +160,15 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def do_POST(self) -> None:
-        """A decision: /accept?row=N or /reject?row=N."""
+        """A decision about a row, such as /reject?row=N."""
         parts = urlsplit(self.path)
         row = parse_qs(parts.query).get("row", [""])[0]
         if not self._allowed() or self.headers.get(HEADER) is None:
             self.send_error(403)
-        elif parts.path not in ("/accept", "/reject") or not row.isdecimal():
+        elif parts.path not in PATHS or not row.isdecimal():
             self.send_error(404)
         else:
-            self.page.decisions.put((int(row), parts.path == "/accept"))
+            self.page.decisions.put(Sent({"do": parts.path[1:], "row": int(row)}, lambda _: None))
             self._begin("text/plain")
 
     def log_message(self, *_: object) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 from diffeo_calib.common.checks import check_number
@@ -15,16 +16,14 @@ from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import placement_sentences
 from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find, refuse_columns
 from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import kinds, sections, sentences
-from diffeo_calib.reports.html.document import Page, rough_millimetres
+from diffeo_calib.reports.html.document import Page, Section
 from diffeo_calib.sensors.places import Places
 
 LOG = logging.getLogger(__name__)
-SECTIONS = (sections.how_good, sections.where, sections.why, sections.trust, sections.repeatability)
 
 
 @small_work()
@@ -70,13 +69,14 @@ def write_report(
         check_number(tolerance, "`tolerance`", above=0.0)
     if of_positions_alone(model, data):
         found = find(model, data, stages=stages, against=against, progress=progress)
-        made = page(found, title, None if data is None else data.sha256, progress)
+        words, made = sentences, sections.sections(found, progress)
     else:
         refuse_columns(against)
         found = find_kinds(model, data, stages=stages, places=places, progress=progress)
-        made = page_of_kinds(found, title, None if data is None else data.sha256)
-    made = replace(made, verdict=f"{judged(found, tolerance)}{made.verdict}")
-    write_whole(path, made.html().encode())
+        words, made = kinds, kinds.sections(found)
+    shown_page = page(found, words, made, title, None if data is None else data.sha256)
+    shown_page = replace(shown_page, verdict=f"{judged(found, tolerance)}{shown_page.verdict}")
+    write_whole(path, shown_page.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
 
@@ -89,38 +89,18 @@ def judged(found: Findings | KindFindings, tolerance: float | None) -> str:
     return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * found.rms:.3f} mm RMS {found.rms_of}. "
 
 
-def page(found: Findings, title: str, data_sha256: str | None, progress: Progress = silent) -> Page:
-    """The page about these findings."""
-    made = []
-    for section in SECTIONS:
-        progress("drawing", len(made), len(SECTIONS))
-        made.append(section(found))
-    name, fit = _names(found.model, title)
-    shown_sha256 = None if found.predictions.left_out else data_sha256
-    return Page(
-        title=name,
-        subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
-        verdict=sentences.verdict(found),
-        advice=list(sentences.advice(found)),
-        figures=dict(_figures(found)),
-        sections=[
-            *made,
-            *kinds.devices(placement_sentences(found.model)),
-            sections.record(found.model, shown_sha256),
-        ],
-    )
-
-
-def page_of_kinds(found: KindFindings, title: str, data_sha256: str | None) -> Page:
-    """The page about rows of any kinds."""
+def page(
+    found: Findings | KindFindings, words: ModuleType, made: Iterable[Section], title: str, data_sha256: str | None
+) -> Page:
+    """The page about these findings: what ``words`` say about them, these sections, and the record of the model."""
     name, fit = _names(found.model, title)
     return Page(
         title=name,
-        subtitle=f"{fit}. Errors: {kinds.rows_of(found)}.",
-        verdict=kinds.verdict(found),
-        advice=list(kinds.advice(found)),
-        figures=dict(kinds.figures(found)),
-        sections=[*kinds.sections(found), sections.record(found.model, data_sha256 if found.new else None)],
+        subtitle=f"{fit}. Errors: {words.rows_of(found)}.",
+        verdict=words.verdict(found),
+        advice=list(words.advice(found)),
+        figures=dict(words.figures(found)),
+        sections=[*made, sections.record(found.model, data_sha256 if found.new else None)],
     )
 
 
@@ -132,20 +112,3 @@ def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:
     note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
     fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}"
     return printable(title or f"Robot {robot}"), fit
-
-
-def _figures(found: Findings) -> Iterator[tuple[str, str]]:
-    for name, errors in found.errors.items():
-        yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
-    *_, own = found.errors.values()
-    if own.angle_rms is not None:
-        yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
-    if len(found.predictions) >= sentences.ENOUGH_FOR_P95:
-        yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
-    yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
-    error = found.expected.error
-    if error.whole > sentences.FAR_RATIO * error.measured:
-        apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
-        yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
-    if found.repeats is not None and found.repeats.telling:
-        yield "repeatability", f"{1e3 * found.limit:.3f} mm"

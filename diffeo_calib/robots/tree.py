@@ -27,9 +27,9 @@ from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError, RobotError, as_written
-from diffeo_calib.robots.joint import ROTARY, Joint, coupling, joint_motions, turned_axes, walk
+from diffeo_calib.robots.joint import Joint, joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import transforms
-from diffeo_calib.runtime.build import ancestors_of, motion_terms
+from diffeo_calib.runtime.build import ROTARY, nominal_chain
 
 BASE = -1
 """Stands for the base where the number of a joint is asked for."""
@@ -87,6 +87,7 @@ class Tree:
         ground_place: number of the place of the link on the ground, the last one; None where that is the base.
         revolute: (n_all,) boolean, False for a slide.
         motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`.
+        arrays: the same constants as NumPy arrays.
     """
 
     def __init__(
@@ -110,56 +111,26 @@ class Tree:
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
         self.moving_names = tuple(joint.name for joint in moving)
         self._check_structure()
-        self._place(moving)
-        driving = [joint for joint in self.drivers if joint.kind != "fixed"]
-        active = [joint for joint in [*moving, *driving] if joint.mimic is None]
+        active = [joint for joint in [*moving, *self.drivers] if joint.kind != "fixed" and joint.mimic is None]
         self.joint_names = tuple(joint.name for joint in active)
         self.kinds = tuple(joint.kind for joint in active)
-        between = f"'{base}' and '{self.tip}'"
-        fixed = [joint.name for joint in [*self.joints, *self.drivers] if joint.kind == "fixed"]
-        self.coupling, self.coupling_offset = coupling(moving, driving, fixed, f"robot '{name}'", between)
-        self.axes = torch.stack([joint.axis for joint in moving])
         limits = [[joint.lower, joint.upper] for joint in active]
         self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
-        self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving], dtype=torch.bool, device="cpu")
-        self.motion_terms = torch.from_numpy(motion_terms(self.axes.numpy(), self.revolute.numpy()))
+        self.arrays = found = nominal_chain(self.to_config())
+        tensors = found.axes, found.revolute, found.coupling, found.coupling_offset
+        self.axes, self.revolute, self.coupling, self.coupling_offset = map(torch.from_numpy, tensors)
+        self.motion_terms, self.ancestors = torch.from_numpy(found.motion_terms), torch.from_numpy(found.ancestors)
+        self.place_offsets, self.before = torch.from_numpy(found.offsets), tuple(found.before.tolist())
+        self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
+        self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
     def _check_structure(self) -> None:
-        """Raise RobotError unless joints, parents and ends make a tree with different names."""
-        count, names = len(self.joints), [*self.moving_names, *(joint.name for joint in self.drivers)]
+        """Raise RobotError unless joints, parents and ends make a tree."""
+        count = len(self.joints)
         if len(self.parents) != count or not all(BASE <= p < k for k, p in enumerate(self.parents)):
             raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
         if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
             raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice and self.moving_names:
-            raise RobotError.of(f"robot '{self.name}' has several joints named {twice}", fix="give each its own name")
-
-    def _place(self, moving: Sequence[Joint]) -> None:
-        """Merge fixed joints: constant transforms of all places, the joints before them, and the ancestor matrix."""
-        eye = torch.eye(4, dtype=torch.float64, device="cpu")
-        after = {BASE: (BASE, eye)}  # for every joint of the description: moving joint before its link, and transform
-        offsets, before = [], []
-        for number, (joint, parent) in enumerate(zip(self.joints, self.parents, strict=True)):
-            last, pending = after[parent]
-            after[number] = last, pending @ joint.origin
-            if joint.kind != "fixed":
-                offsets.append(after[number][1])
-                before.append(last)
-                after[number] = len(offsets) - 1, eye
-        for tip in self.tips:
-            if after[self.ends[tip]][0] == BASE:
-                fix = "choose a base and a tip with a moving joint between them"
-                what = f"robot '{self.name}' has no moving joint from '{self.base}' to '{tip}'"
-                raise RobotError.of(what, fix=fix)
-        places = [after[end] for end in self.ends.values()]
-        if self.ground != BASE:
-            places.append(after[self.ground])
-        self.place_offsets = torch.stack([*offsets, *(offset for _, offset in places)])
-        self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
-        self.before = (*before, *(last for last, _ in places))
-        self.ancestors = torch.from_numpy(ancestors_of(self.before, len(moving)))
-        self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
     def reversed(self, tip: str | None = None) -> Tree:
         """The same robot with one of its tips as base; gravity still acts as on the ground.
@@ -379,7 +350,7 @@ def seen_from(
     while link != BASE:
         way.append(link)
         end = last[link]
-        for joint in _backwards(joints[link]):
+        for joint in backwards(joints[link]):
             end = add(joint, end)
         link = parents[link]
         last[link] = end
@@ -389,7 +360,7 @@ def seen_from(
     return found, before, last
 
 
-def _backwards(joint: Joint) -> list[Joint]:
+def backwards(joint: Joint) -> list[Joint]:
     """The joint from its link to its parent: its motion, then a fixed transform."""
     turned = joint.origin[:3, :3].T
     back = transforms(turned, -turned @ joint.origin[:3, 3])

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-
-import torch
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
 from diffeo_calib.robots.joint import KINDS, Joint
-from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree
+from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, backwards
 from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of
 
 Names = str | Sequence[str]
@@ -220,13 +218,9 @@ def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> lis
 
 
 def _joints_of(step: _Step, path: Path) -> list[Joint]:
-    """A step as joints: upwards, the motion about the opposite axis and the inverse of the origin after it."""
+    """A step as joints."""
     joint = joint_of(step.joint, path)
-    if not step.up:
-        return [joint]
-    eye = torch.eye(4, dtype=torch.float64, device="cpu")
-    back = Joint(f"{joint.name} (origin)", "fixed", torch.linalg.inv(joint.origin))
-    return [back] if joint.kind == "fixed" else [replace(joint, origin=eye, axis=-joint.axis), back]
+    return backwards(joint) if step.up else [joint]
 
 
 def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:

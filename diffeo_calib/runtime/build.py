@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau
 from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
@@ -25,6 +27,36 @@ COINCIDENT = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compliance:
+    """One compliance and its family of features: the sag of a joint's frame in one direction; see robots/gravity.py.
+
+    Args:
+        joint: number of the moving joint whose frame sags.
+        direction: (6,) unit twist in the frame before the joint's motion, translation first.
+        own: whether it is along the joint's own motion (else lateral).
+        places: numbers of the places at which masses pull. Empty for a slide along its axis, where the feature is the
+            force itself.
+        loaded: whether the load is the payload, whose mass is known.
+    """
+
+    joint: int
+    direction: Array
+    own: bool
+    places: tuple[int, ...]
+    loaded: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of its features."""
+        return 3 * max(len(self.places), 1)
+
+    @property
+    def axis(self) -> Array:
+        """(3,) the unit vector along which it slides, or about which it turns."""
+        return self.direction[3:] if self.places else self.direction[:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,38 +80,80 @@ class NominalChain:
     coupling: Array
     coupling_offset: Array
 
+    @cached_property
+    def ancestors(self) -> np.ndarray:
+        """(F, n_all) whether joint l moves place f."""
+        found = np.zeros((len(self.before), len(self.axes)), dtype=bool)
+        for place, last in enumerate(self.before):
+            if last >= 0:
+                found[place] = found[last]
+                found[place, last] = True
+        return found
 
-def ancestors_of(before: Sequence[int] | np.ndarray, joints: int) -> np.ndarray:
-    """(F, n_all) whether joint l moves place f, from the joints before the places, -1 for the base."""
-    found = np.zeros((len(before), joints), dtype=bool)
-    for place, last in enumerate(before):
-        if last >= 0:
-            found[place] = found[last]
-            found[place, last] = True
-    return found
+    @cached_property
+    def motion_terms(self) -> Array:
+        """(4, n_all, 4, 4) C, S, D, L of J_l = C + S sin q + D cos q + L q.
 
+        Rodrigues: 1 + K^2 + K sin q - K^2 cos q.
+        """
+        K = skew(self.axes) * self.revolute[:, None, None]
+        out = np.zeros((4, len(self.axes), 4, 4))
+        out[0] = np.eye(4)
+        out[0, :, :3, :3] += K @ K
+        out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
+        out[3, :, :3, 3] = self.axes * ~self.revolute[:, None]
+        return out
 
-def motion_terms(axes: Array, revolute: np.ndarray) -> Array:
-    """(4, n_all, 4, 4) C, S, D, L of J_l = C + S sin q + D cos q + L q: Rodrigues 1 + K^2 + K sin q - K^2 cos q."""
-    K = skew(axes) * revolute[:, None, None]
-    out = np.zeros((4, len(axes), 4, 4))
-    out[0] = np.eye(4)
-    out[0, :, :3, :3] += K @ K
-    out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
-    out[3, :, :3, 3] = axes * ~revolute[:, None]
-    return out
+    @cached_property
+    def seen_from_ground(self) -> tuple[np.ndarray, Array]:
+        """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
+
+        A joint between base and ground moves what is on the base's side, in the opposite sense.
+        """
+        moved, signs = self.ancestors.copy(), np.ones(len(self.axes))
+        if self.grounded:
+            between = self.ancestors[-1]
+            moved[:, between] = ~moved[:, between]
+            signs[between] = -1.0
+        return moved, signs
+
+    @cached_property
+    def distinct(self) -> np.ndarray:
+        """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
+        far = np.linalg.norm(self.offsets[:, :3, 3], axis=1) > COINCIDENT
+        ends = (self.before < 0) & (np.arange(len(self.before)) >= len(self.axes))
+        return far | np.where(self.before < 0, ends, ~self.revolute[self.before])
+
+    @cached_property
+    def compliances(self) -> tuple[Compliance, ...]:
+        """Every joint's own compliance and its two lateral ones (three for a slide)."""
+        moved, found = self.seen_from_ground[0] & self.distinct[:, None], []
+        for joint, axis in enumerate(self.axes):
+            beyond = tuple(place for place in np.flatnonzero(moved[:, joint]).tolist() if place != joint)
+            if not self.revolute[joint]:
+                found.append(Compliance(joint, np.append(axis, np.zeros(3)), True, ()))
+            if beyond:
+                turns = np.pad([axis, *perpendicular(axis)], ((0, 0), (3, 0)))
+                own = bool(self.revolute[joint]), False, False
+                found += [Compliance(joint, *turn, beyond) for turn in zip(turns, own, strict=True)]
+        return tuple(found)
 
 
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
-    """The robot that is described as in model files (Tree.to_config)."""
-    joints, serial = robot["joints"], "tip" in robot
+    """The robot that is described as in model files (Tree.to_config).
+
+    Raises:
+        RobotError: a tip without a moving joint before it, two joints with one name, a joint that mimics a fixed joint
+            or one that is not there, or joints that mimic one another in a circle.
+    """
+    joints, serial, drivers = robot["joints"], "tip" in robot, robot.get("drivers", ())
     parents = range(-1, len(joints) - 1) if serial else robot["parents"]
     tips = {robot["tip"]: len(joints) - 1} if serial else dict(robot["tips"])
     ends, ground = [*tips.values()], -1
     if not serial:
         ground = robot["ground"]
-        ends += [number for _, number in robot["loads"]] + ([ground] if ground >= 0 else [])
-    after: dict[int, tuple[int, Array]] = {-1: (-1, np.eye(4))}
+        ends = [*(tips | dict(robot["loads"])).values()] + ([ground] if ground >= 0 else [])
+    after: dict[int, tuple[int, Array]] = {-1: (-1, np.eye(4))}  # moving joint before a link, and transform from it
     offsets, before = [], []
     for number, (joint, parent) in enumerate(zip(joints, parents, strict=True)):
         last, pending = after[parent]
@@ -88,13 +162,23 @@ def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
             offsets.append(after[number][1])
             before.append(last)
             after[number] = len(offsets) - 1, np.eye(4)
+    for tip, end in tips.items():
+        if after[end][0] < 0:
+            what = f"robot '{robot['name']}' has no moving joint from '{robot['base']}' to '{tip}'"
+            raise RobotError.of(what, fix="choose a base and a tip with a moving joint between them")
     offsets += [after[end][1] for end in ends]
     before += [after[end][0] for end in ends]
     moving = [joint for joint in joints if joint["kind"] != "fixed"]
+    names = [joint["name"] for joint in (*moving, *drivers)]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RobotError.of(f"robot '{robot['name']}' has several joints named {twice}", fix="give each its own name")
     axes = np.array([joint["axis"] for joint in moving], float)
-    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     revolute = np.array([joint["kind"] in ROTARY for joint in moving])
-    table = _coupling(moving, [joint for joint in robot.get("drivers", ()) if joint["kind"] != "fixed"])
+    fixed = [joint["name"] for joint in (*joints, *drivers) if joint["kind"] == "fixed"]
+    between = f"'{robot['base']}' and '{', '.join(tips)}'"
+    driving = [joint for joint in drivers if joint["kind"] != "fixed"]
+    table = _coupling(moving, driving, fixed, f"robot '{robot['name']}'", between)
     places = np.array(offsets), np.array(before), tuple(tips), ground >= 0
     return NominalChain(*places, axes, revolute, table[:, :-1].copy(), table[:, -1].copy())
 
@@ -105,25 +189,59 @@ def active_joints(robot: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [joint for joint in every if joint["kind"] != "fixed" and joint["mimic"] is None]
 
 
-def _coupling(joints: Sequence[Mapping[str, Any]], drivers: Sequence[Mapping[str, Any]]) -> Array:
-    """Values of the moving joints from those of the active ones and 1: (n_all, n + 1).
+def _coupling(
+    moving: Sequence[Mapping[str, Any]],
+    drivers: Sequence[Mapping[str, Any]],
+    fixed: Sequence[str],
+    robot: str,
+    between: str,
+) -> Array:
+    """Values of all moving joints by those of the n active ones, and 1: (n_all, n + 1), rad or m.
 
-    Raises:
-        ValueError: joints that mimic each other in a circle, or joints that are not there.
+    Args:
+        moving: the n_all joints that move something. drivers: joints that drive some of these and move nothing else.
+        fixed: names of fixed joints. robot: which robot it is, for messages. between: links where its joints are.
     """
-    moving = [*joints, *drivers]
-    active = [joint["name"] for joint in moving if joint["mimic"] is None]
-    units = np.eye(len(active) + 1)
-    rows = dict(zip(active, units[:-1], strict=True))
-    for _ in moving:  # every round finds a mimic joint at least
-        for joint in moving:
-            driving = joint["mimic"] or {}
-            if joint["name"] not in rows and all(name in rows for name in driving):
-                driven = sum(slope * rows[name] for name, slope in driving.items())
-                rows[joint["name"]] = driven + joint["mimic_offset"] * units[-1]
-    if len(rows) < len(moving):
-        raise ValueError("joints that mimic each other in a circle, joints that are not there, or one name twice")
-    return np.array([rows[joint["name"]] for joint in joints])
+    every = [*moving, *drivers]
+    active = [joint["name"] for joint in every if joint["mimic"] is None]
+    units = np.eye(len(active) + 1)  # a column per active joint, one of constants
+    rows: dict[str, Any] = dict(zip(active, units, strict=False))
+    waiting = {joint["name"]: joint["mimic"] for joint in every if joint["mimic"] is not None}
+    names = {joint["name"] for joint in every}
+    for name, mimic in waiting.items():
+        for driver in mimic:
+            if driver not in names:
+                raise _no_driver(name, driver, robot, between, fixed=driver in fixed)
+    constants = {joint["name"]: joint["mimic_offset"] * units[-1] for joint in every}
+    while waiting:
+        ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
+        if not ready:
+            what = f"joints of {robot} mimic each other in a circle: {' -> '.join(_circle(waiting))}"
+            raise RobotError.of(what, fix="make one of them active")
+        for name in ready:
+            mimic = waiting.pop(name)
+            rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
+    return np.array([rows[joint["name"]] for joint in moving])
+
+
+def _no_driver(name: str, driver: str, robot: str, between: str, *, fixed: bool) -> RobotError:
+    """The error of a joint that mimics one that does not move, or that is not there."""
+    what = f"joint '{name}' of {robot} mimics '{driver}'"
+    if fixed:
+        fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
+        return RobotError.of(f"{what}, which is fixed", fix=fix)
+    fix = "choose a base and a tip with that joint between them, correct its name, or make the joint active"
+    return RobotError.of(f"{what}, which is not a joint between {between}", fix=fix)
+
+
+def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Names of joints in one circle, closed by the first; every joint of ``waiting`` mimics another one of them."""
+    path = [next(iter(waiting))]
+    while True:
+        driver = next(name for name in waiting[path[-1]] if name in waiting)
+        if driver in path:
+            return [*path[path.index(driver) :], driver]
+        path.append(driver)
 
 
 def calibrated_chain(
@@ -150,8 +268,8 @@ def calibrated_chain(
         twists=constant,
         tips=nominal.offsets[L : L + T],
         before=nominal.before,
-        ancestors=ancestors_of(nominal.before, L),
-        motions=motion_terms(nominal.axes, nominal.revolute),
+        ancestors=nominal.ancestors,
+        motions=nominal.motion_terms,
         axes=nominal.axes,
         revolute=nominal.revolute,
         coupling=nominal.coupling,
@@ -162,52 +280,21 @@ def calibrated_chain(
 
 def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
     """The sag with these coefficients: m_k = sum_f (o_f - o_l) x c_f for the masses at the places f beyond joint l."""
-    steps, before = nominal.offsets, nominal.before
-    F, L = len(steps), len(nominal.axes)
-    distinct = distinct_places(steps, before, nominal.revolute)
-    moved, signs = seen_from_ground(ancestors_of(before, L), grounded=nominal.grounded)
-    joints, axes, moments, forces, directions, first = [], [], [], [], [], 0
-    for joint, axis in enumerate(nominal.axes):
-        beyond = [place for place in range(F) if moved[place, joint] and distinct[place] and place != joint]
-        turns = [axis, *perpendicular(axis)]
-        slides = [] if nominal.revolute[joint] else [axis]
-        for direction, sliding in [*((e, True) for e in slides), *((e, False) for e in turns if beyond)]:
-            size = 3 if sliding else 3 * len(beyond)
-            c = coefficients[first : first + size].reshape(-1, 3)
-            first += size
-            W, twist = np.zeros((3, F, 3)), np.zeros((L, 6))
-            if not sliding:
-                W[:, beyond] = -skew(c).swapaxes(0, 1)
-                W[:, joint] = skew(c.sum(0))
-            twist[joint, : 3 if sliding else 6][-3:] = direction
-            joints.append(joint)
-            axes.append(direction)
-            moments.append(W.reshape(3, -1))
-            forces.append(c[0] if sliding else np.zeros(3))
-            directions.append(twist.ravel())
-    tables = np.array(joints), np.array(axes), np.concatenate(moments), np.array(forces), np.array(directions)
-    return Sag(steps, before, nominal.grounded, moved, signs, *tables)
-
-
-def seen_from_ground(ancestors: np.ndarray, *, grounded: bool) -> tuple[Array, Array]:
-    """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
-
-    A joint between base and ground, which is the last place if ``grounded``, moves what is on the base's side, in the
-    opposite sense.
-    """
-    moved, signs = ancestors.copy(), np.ones(ancestors.shape[1])
-    if grounded:
-        between = ancestors[-1]
-        moved[:, between] = ~moved[:, between]
-        signs[between] = -1.0
-    return moved.astype(float), signs
-
-
-def distinct_places(offsets: Array, before: np.ndarray, revolute: np.ndarray) -> np.ndarray:
-    """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
-    far = np.linalg.norm(offsets[:, :3, 3], axis=1) > COINCIDENT
-    ends = (before < 0) & (np.arange(len(before)) >= len(revolute))
-    return far | np.where(before < 0, ends, ~revolute[before])
+    own, F, L = nominal.compliances, len(nominal.offsets), len(nominal.axes)
+    moments, forces, directions = (np.zeros((len(own), *shape)) for shape in ((3, F, 3), (3,), (L, 6)))
+    sizes = np.cumsum([compliance.size for compliance in own])
+    for k, (compliance, w) in enumerate(zip(own, np.split(coefficients, sizes[:-1]), strict=True)):
+        c = w.reshape(-1, 3)
+        if compliance.places:
+            moments[k, :, list(compliance.places)] = -skew(c)
+            moments[k, :, compliance.joint] = skew(c.sum(0))
+        else:
+            forces[k] = c[0]
+        directions[k, compliance.joint] = compliance.direction
+    moved, signs = nominal.seen_from_ground
+    axes, joints = np.array([c.axis for c in own]), np.array([c.joint for c in own])
+    flat = moments.reshape(-1, 3 * F), forces, directions.reshape(-1, 6 * L)
+    return Sag(nominal.offsets, nominal.before, nominal.grounded, moved.astype(float), signs, joints, axes, *flat)
 
 
 def perpendicular(axis: Array) -> Array:

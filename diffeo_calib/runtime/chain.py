@@ -141,7 +141,7 @@ class CalibratedChain:
 
     def _poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """The same for joint values that include their waves."""
-        motions = joint_motions(self, q)
+        motions, L = joint_motions(self, q), len(self.axes)
         nominal = None if self.sag is None else nominal_frames(self.sag, motions)
         twists = self.twists[None] if nominal is None else error_twists(self, nominal)
         offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
@@ -159,27 +159,13 @@ class CalibratedChain:
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
         if nominal is None or self.sag is None:
             return tips, by_moving @ self.coupling
-        slopes = self._sag_slopes(self.sag, nominal)  # (N, L, 6, L)
+        amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
+        slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
         shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
         turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
         moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
         sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
         return tips, (by_moving + np.concatenate(sums, axis=2)) @ self.coupling
-
-    def _sag_slopes(self, sag: Sag, nominal: Array) -> Array:
-        """Derivatives of the twists by the moving joints: (N, n_all, 6, n_all)."""
-        (N, F), L = nominal.shape[:2], len(self.axes)
-        e, m = loads(sag, nominal)
-        z = (nominal[:, :L, :3, :3] @ self.axes[..., None])[..., 0] * sag.signs[:, None]  # (N, L, 3)
-        origins = nominal[..., :3, 3]
-        spun = np.where(self.revolute[:, None], z, 0.0)[:, None]  # (N, 1, L, 3)
-        arms = origins[:, :, None] - origins[:, None, :L]  # (N, F, L, 3)
-        moved = np.where(self.revolute[:, None], cross(z[:, None], arms), z[:, None])
-        moved = moved * sag.moved[None, :, :, None]
-        slopes_m = (sag.moments @ moved.swapaxes(2, 3).reshape(N, 3 * F, L)).reshape(*e.shape, L)
-        slopes_e = cross(spun, e[:, :, None]) * sag.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
-        amounts = np.einsum("nkc,nkcl->nkl", e, slopes_m) + np.einsum("nklc,nkc->nkl", slopes_e, m)
-        return (sag.directions.T @ amounts).reshape(N, L, 6, L)
 
 
 class Operations(NamedTuple):
@@ -264,6 +250,22 @@ def loads(sag: Any, nominal: Any) -> tuple[Any, Any]:
     e = (nominal[:, sag.joints, :3, :3] @ sag.axes[..., None])[..., 0]
     m = nominal[..., :3, 3].reshape(-1, sag.moments.shape[1]) @ sag.moments.T
     return e, m.reshape(e.shape) + sag.forces
+
+
+def load_slopes(axes: Any, revolute: Any, sag: Any, nominal: Any) -> Any:
+    """Derivatives of the twist coordinates e . m by the moving joints: (N, K, n_all).
+
+    Turning joint k moves what it carries, M_fk = 1, by z_k x (o_f - o_k), a slide by z_k; e turns where M_lk = 1.
+    """
+    (N, F), L = nominal.shape[:2], len(axes)
+    e, m = loads(sag, nominal)
+    z = (nominal[:, :L, :3, :3] @ axes[..., None])[..., 0] * sag.signs[:, None]  # (N, L, 3)
+    origins, spun = nominal[..., :3, 3], (z * revolute[:, None])[:, None]  # (N, F, 3), (N, 1, L, 3)
+    moved = cross(spun, origins[:, :, None] - origins[:, None, :L]) + (z * ~revolute[:, None])[:, None]
+    moved = moved * sag.moved[None, :, :, None]  # (N, F, L, 3)
+    slopes_m = (sag.moments @ moved.swapaxes(2, 3).reshape(N, 3 * F, L)).reshape(*e.shape, L)
+    slopes_e = cross(spun, e[:, :, None]) * sag.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
+    return (e[:, :, None] @ slopes_m)[:, :, 0] + (slopes_e @ m[..., None])[..., 0]
 
 
 def transforms(twists: Array) -> Array:

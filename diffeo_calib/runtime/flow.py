@@ -54,7 +54,7 @@ class RadialTerm:
         lines, circles = self._columns
         parts = []
         if self.lines:
-            parts.append((x[..., lines] - self._centre) * self._line_scales)
+            parts.append((x[..., lines] - self.centre) * self._line_scales)
         if self.circles:
             angles = x[..., circles]
             parts += [np.cos(angles) * self._circle_scales, np.sin(angles) * self._circle_scales]
@@ -118,7 +118,7 @@ class RadialTerm:
         return as_index(self.lines), as_index(self.circles)
 
     @cached_property
-    def _centre(self) -> Array:
+    def centre(self) -> Array:
         """Centre of the controls on the lines: differences of far points would lose digits."""
         return self.controls[..., list(self.lines)].mean(axis=(0, 1))
 
@@ -131,22 +131,22 @@ class RadialTerm:
         return self.scales[len(self.lines) :]
 
     @cached_property
-    def _features(self) -> Array:
-        """(S, C, D)."""
+    def features(self) -> Array:
+        """(S, C, D) those of the controls."""
         return self.lift(self.controls)
 
     @cached_property
     def _exponents(self) -> Array:
         """(S, D + 1, C): (F, 1) times it is F . F_j - |F_j|^2 / 2, less |F|^2 / 2 where that is constant (circles)."""
-        squares = 0.5 * (self._features**2).sum(-1)
+        squares = 0.5 * (self.features**2).sum(-1)
         if not self.lines:
             squares = squares + 0.5 * (self._circle_scales**2).sum()
-        return np.ascontiguousarray(np.concatenate([self._features.swapaxes(1, 2), -squares[:, None]], axis=1))
+        return np.ascontiguousarray(np.concatenate([self.features.swapaxes(1, 2), -squares[:, None]], axis=1))
 
     @cached_property
     def _products(self) -> Array:
         """w_j, then w_j F_j^T: (S, C, n + n D)."""
-        outer = self.weights[..., :, None] * self._features[..., None, :]
+        outer = self.weights[..., :, None] * self.features[..., None, :]
         return np.concatenate([self.weights, outer.reshape(*outer.shape[:2], -1)], axis=-1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -125,19 +126,26 @@ def nearest_poses(points: Array) -> Array:
     return out
 
 
-def pose_slopes(points: Array, slopes: Array, R: Array) -> Array:
-    """Derivatives of the nearest poses; kinematics/tool.py derives the formula.
+def pose_slopes(points: Any, slopes: Any, R: Any, use: tuple[Any, Any, Any] = (np, MARKS, np.eye(3))) -> Any:
+    """Derivative of the pose that fits three points best, exact also where they are not rigid.
+
+    With S = sum_k (p_k - c) u_k^T = R P, R the rotation and P symmetric, a change dS turns R by R exp([b]x),
+
+        (tr(P) 1 - P) b = axial(R^T dS - dS^T R).
 
     Args:
-        points: (N, 3, 3). slopes: (N, 3, 3, n) their derivatives. R: (N, 3, 3) the nearest rotations.
+        points: (N, 3, 3) the three points, one per row [m]. slopes: (N, 3, 3, n) their derivatives by n parameters.
+        R: (N, 3, 3) the rotations of the poses.
+        use: an array library with its :data:`MARKS` and unit matrix.
 
     Returns:
-        (N, 6, n) velocity of the origin, then angular velocity.
+        (N, 6, n) velocity of the origin, then angular velocity, about the axes of the points' frame.
     """
-    centre, centred = slopes.mean(axis=1), points - points.mean(axis=1, keepdims=True)
-    P = R.swapaxes(1, 2) @ (centred.swapaxes(1, 2) @ MARKS)
-    dS = np.einsum("nkcj,kd->njcd", slopes - centre[:, None], MARKS)
+    library, marks, one = use
+    centre, centred = slopes.mean(1), points - points.mean(1)[:, None]
+    P = R.swapaxes(1, 2) @ (centred.swapaxes(1, 2) @ marks)
+    dS = library.einsum("nkcj,kd->njcd", slopes - centre[:, None], marks)
     A = R.swapaxes(1, 2)[:, None] @ dS
-    axial = np.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], axis=1)
-    turning = np.trace(P, axis1=1, axis2=2)[:, None, None] * np.eye(3) - P
-    return np.concatenate([centre, R @ np.linalg.solve(turning, axial)], axis=1)
+    turns = A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]
+    turning = library.einsum("nkk->n", P)[:, None, None] * one - P
+    return library.concatenate([centre, R @ library.linalg.solve(turning, library.stack(turns, 1))], 1)

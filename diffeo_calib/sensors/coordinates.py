@@ -7,7 +7,7 @@ middles are found; other devices report readings. :func:`sensor_of` knows the ki
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,11 +18,12 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
+from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.places import (
     BALL_IS_THE_MARKER,
@@ -36,11 +37,12 @@ from diffeo_calib.sensors.places import (
     placed,
     sensor_key,
 )
+from diffeo_calib.sensors.tables import Coordinates
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
 NUMBERS_OF_A_SOCKET = 3
-LARGEST_RMS_M = 5e-3
+LARGEST_MEDIAN_M = 5e-3
 """Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
 
 
@@ -256,8 +258,13 @@ class OtherDevices(Sensor):
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        return self.in_unit(data, devices, devices.errors(data, devices.points_of(points)))
+
+    @staticmethod
+    def in_unit(data: Readings, devices: Devices, errors: Tensor) -> Evaluation:
+        """Errors (N, r), m, in the unit of the device."""
         unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
-        away = per_unit * devices.in_unit(data, devices.errors(data, devices.points_of(points)))
+        away = per_unit * devices.in_unit(data, errors)
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
@@ -268,16 +275,40 @@ class OtherDevices(Sensor):
         """The devices, with the standard deviations of their increments."""
         found = placed(data, points)
         seen = found.points_of(points)
-        rms = float(found.errors(data, seen).norm(dim=1).square().mean().sqrt())
-        if rms > LARGEST_RMS_M:
+        median = float(found.errors(data, seen).norm(dim=1).median())
+        if median > LARGEST_MEDIAN_M:
             fix = "recalibrate, which finds another ball; or check the rows"
-            expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
-            raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
+            expected, got = f"at most {1e3 * LARGEST_MEDIAN_M:g} mm at the ball", f"{1e3 * median:.3g} mm"
+            raise MeasurementError.of(
+                "median error of readings at the best places", expected=expected, got=got, fix=fix
+            )
         deviations = found.open_deviations(data, seen)
         return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
 
 
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}
+
+
+def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[Any]) -> Evaluations:
+    """Errors of rows of any kinds, laid out by coordinates and readings, kind by kind and in their own units.
+
+    Args:
+        errors: (N, R) m, NaN where nothing was measured; those of poses are of the points that represent each.
+        own: rows that tell coordinates, which are their first numbers.
+        readings: sets of devices of readings, with their rows and where their numbers stand.
+    """
+    found = list[tuple[Evaluation, Tensor]]()
+    if own is not None:
+        resting = own.table.socket_numbers != NO_SOCKET
+        for what, rows in ((ERRORS, ~resting), (SPREAD, resting)):
+            if bool(rows.any()):
+                sizes, lines = errors[own.rows[rows]].unflatten(1, (-1, 3)).norm(dim=2), own.table.line_numbers[rows]
+                kind = "socket" if what == SPREAD else own.table.device_rows().kind
+                found.append((Evaluation(sizes, line_numbers=lines, what=what, kind=kind), own.rows[rows]))
+    for one in readings:
+        numbers = errors[one.rows[:, None], one.numbers]
+        found.append((OtherDevices.in_unit(one.data, one.devices, numbers), one.rows))
+    return Evaluations.of(found, len(errors))
 
 
 def sensor_of(data: Any) -> Sensor:

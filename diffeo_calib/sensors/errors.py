@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +25,11 @@ WORDS = {
     READINGS: "errors of readings",
 }
 COMPONENTS = ("dx", "dy", "dz")
+
+
+def shown_unit(unit: str) -> tuple[str, float]:
+    """Unit in which numbers are shown, and how many of it are one of ``unit``."""
+    return ("mm", 1e3) if unit == "m" else (unit, 1.0)
 
 
 def errors_frame(errors: Any) -> Any:
@@ -150,7 +155,13 @@ class Evaluation:
     @property
     def shown(self) -> tuple[str, float]:
         """Unit in which the numbers are shown, and how many of it are one of ``unit``."""
-        return ("mm", 1e3) if self.unit == "m" else (self.unit, 1.0)
+        return shown_unit(self.unit)
+
+    @property
+    def rms_text(self) -> str:
+        """Root mean square with its unit."""
+        unit, per_unit = self.shown
+        return f"{per_unit * self.rms:.4f} {unit}"
 
     def __repr__(self) -> str:
         text = f"{len(known(self.errors))} {WORDS[self.what]} in {self.unit}: "
@@ -268,6 +279,18 @@ class Evaluations(Mapping[str, Evaluation]):
         self._kinds, self.index, self.total = dict(kinds), dict(index), count
         self.placed, self.numbers = tuple(placed), numbers
 
+    @classmethod
+    def of(
+        cls, found: Iterable[tuple[Evaluation, Tensor]], count: int, placed: Sequence[str] = (), numbers: int = 0
+    ) -> Evaluations:
+        """Those of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2."""
+        kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
+        for one, rows in found:
+            taken = sum(other.kind == one.kind for other in kinds.values())
+            name = f"{one.kind} {taken + 1}" if taken else one.kind
+            kinds[name], index[name] = one, rows
+        return cls(kinds, index, count, placed, numbers)
+
     def __getitem__(self, kind: str) -> Evaluation:
         return self._kinds[kind]
 
@@ -302,29 +325,40 @@ class Evaluations(Mapping[str, Evaluation]):
         return self.positions or next(iter(self.values()))
 
     def _measured(self) -> Evaluation:
-        if self.positions is None:
+        if self.positions is None and len(self) > 1:
             fix = f"name the kind, one of {listed(list(self))}: no position was measured, and units differ"
             raise InputError.of("one error of rows of several kinds", fix=fix)
-        return self.positions
+        return self.main
+
+    @property
+    def positions_rms(self) -> float | None:
+        """Root mean square error of measured positions, m; None where none was measured."""
+        return None if self.positions is None else self.positions.rms
+
+    @property
+    def rms_text(self) -> str:
+        """Root mean square of every kind with its unit."""
+        what = {SPREAD: " (spread)", READINGS: " (readings)"}
+        return ", ".join(f"{kind} {one.rms_text}{what.get(one.what, '')}" for kind, one in self.items())
 
     @property
     def rms(self) -> float:
-        """Root mean square error of measured positions, m; InputError if none was measured."""
+        """Root mean square error of measured positions, m; else of the only kind in its unit, of several InputError."""
         return self._measured().rms
 
     @property
     def median(self) -> float:
-        """Median error of measured positions, m; InputError if none was measured."""
+        """Median error, as :attr:`rms`."""
         return self._measured().median
 
     @property
     def p95(self) -> float:
-        """95th percentile of the errors of measured positions, m; InputError if none was measured."""
+        """95th percentile of the errors, as :attr:`rms`."""
         return self._measured().p95
 
     @property
     def max(self) -> float:
-        """Largest error of a measured position, m; InputError if none was measured."""
+        """Largest error, as :attr:`rms`."""
         return self._measured().max
 
     def lines(self) -> Iterator[dict[str, Any]]:

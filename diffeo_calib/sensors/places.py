@@ -6,7 +6,7 @@ Where the devices of a calibration were found: what a model keeps of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -227,6 +227,23 @@ class PlacedDevices:
             self.shown or other.shown,
         )
 
+    def carried(self, T: Tensor, before: Tensor, after: Tensor) -> PlacedDevices:
+        """The same devices beside another model: those of readings read of its points what they read before.
+
+        Args:
+            T: (4, 4) from the old frame to the new one, m.
+            before, after: (N, P, 3) points of the old and the new model at the rows of the fit, m.
+        """
+        if self.kind == SESSION:
+            moved = self.constants.view(-1, 4, 4) @ torch.linalg.inv(T)
+            return replace(self, constants=moved.flatten(1))
+        if self.kind == SOCKET:
+            return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
+        if self.devices is None:
+            return self
+        each = [_carried(self.devices, number, before, after) for number in range(len(self.names))]
+        return replace(self, constants=torch.stack(each))
+
     @property
     def devices(self) -> Devices | None:
         """As devices of readings; None for other kinds, and for those that nobody registered."""
@@ -283,6 +300,18 @@ class PlacedDevices:
         if len(numbers) != len(device) or not inside:
             raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
         return cls(entry["kind"], names, constants, deviations, numbers, device, _shown(entry.get("shown")))
+
+
+def _carried(devices: Devices, number: int, before: Tensor, after: Tensor) -> Tensor:
+    """Constants (c,) of the device that reads of points (N, P, 3) what another one reads of others, m."""
+    old, new = devices.points_of(before), devices.points_of(after)
+    sees = devices.sees(old, torch.full((len(old),), number, dtype=torch.int64, device=HOST))
+    old, new = old[sees], new[sees]
+    own = torch.zeros(len(old), dtype=torch.int64, device=HOST)
+    values = devices.observation(own + number).value(old) / devices.metres[number]
+    read = Readings(devices.kind, old[:, :1], values, own, devices.names[number : number + 1])
+    start = replace(devices, names=read.names, constants=devices.start(values, devices.bodies(new))[None])
+    return start.refined(read, new).constants[0]
 
 
 def _shown(entry: Any) -> Shown | None:

@@ -74,6 +74,13 @@ def height(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
     return reading("height", arm, rows, seed)
 
 
+def laden_height(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
+    """Heights of a ball under payloads that change from row to row."""
+    masses = one(0.0, 4.0, 10.0)[torch.arange(rows) // 3 % 3]
+    whole = reading_bank.readings(arm, "height", rows, noise=2e-5, seed=seed, payload=masses)
+    return whole.with_payload(masses)
+
+
 def distance(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
     return reading("distance", arm, rows, seed)
 
@@ -134,9 +141,9 @@ def model(old: Rows, markers: int = 1) -> dc.CalibratedKinematics:
         ).model
 
 
-def true_error(model: dc.CalibratedKinematics, robot: SimulatedArm) -> float:
+def true_error(model: dc.CalibratedKinematics, robot: SimulatedArm, payload: float | None = None) -> float:
     """RMS distance, m, of the first point of a model from the truth over the joint ranges, after a rigid fit."""
     q = robot.sample(300, seed=99)
-    found, truth = model(q).detach()[:, 0], robot.true_points(q)[:, 0]
+    found, truth = model(q).detach()[:, 0], robot.true_points(q, payload)[:, 0]
     T = rigid_fit(found, truth)
     return float((found @ T[:3, :3].mT + T[:3, 3] - truth).square().sum(1).mean().sqrt())

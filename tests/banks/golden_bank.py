@@ -343,7 +343,12 @@ def errors(result: Result, rows: Rows) -> Numbers:
         return {"errors": result.reading_errors(rows)[1], "evaluation": one(dc.evaluate(result.model, rows).rms)}
     summary, parts = result.model.summary, one(*(part.displacement for part in result.parts))
     assert summary is not None
-    known = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms
+    stages = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms
+    known = (value for value in stages if value is not None)
     aligned = result.aligned(rows)  # pyright: ignore[reportArgumentType]
     evaluated = dc.evaluate(result.model, aligned.with_sessions(None) if result.sessions else aligned)
-    return {"rms": one(*known), "parts": parts, "evaluation": one(evaluated.rms)}
+    return {
+        "rms": one(*known),
+        "parts": parts,
+        "evaluation": one(evaluated.rms),
+    }

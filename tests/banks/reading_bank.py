@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tangent_bank import normal
 from torch import Tensor
@@ -16,8 +18,8 @@ EYES = torch.tensor([[2.8, 0.5, 1.0], [-1.5, 2.5, 1.2], [-0.5, -2.9, 0.2]], dtyp
 FOCAL, CENTRE = (3500.0, 3400.0), (1200.0, 1000.0)
 
 
-def in_base(arm: SimulatedArm, q: Tensor) -> Tensor:
-    return (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
+def in_base(arm: SimulatedArm, q: Tensor, payload: float | Tensor | None = None) -> Tensor:
+    return (arm.true_points(q, payload)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
 
 
 def cameras() -> Tensor:
@@ -35,11 +37,19 @@ def pixels(z: Tensor, which: Tensor) -> Tensor:
 
 
 def readings(
-    arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0, *, seed: int = 1
+    arm: SimulatedArm,
+    kind: str,
+    rows: int,
+    zero: float = 0.0,
+    noise: float = 0.0,
+    *,
+    seed: int = 1,
+    payload: float | Tensor | None = None,
+    turned: Callable[[Tensor], Tensor] = lambda q: q,
 ) -> dc.Readings:
     q, which = arm.sample(rows, seed), torch.arange(rows) % 3
     names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=seed + 2)
-    z, joints = in_base(arm, q), arm.nominal.joint_names
+    z, joints = in_base(arm, turned(q), payload), arm.nominal.joint_names
     if kind == "image":
         seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=seed + 2)
         return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)

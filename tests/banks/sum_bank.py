@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
+from typing import Any
 
 import pytest
 import torch
@@ -27,6 +28,18 @@ PROFILES = (GaussianProfile(), CauchyProfile(), ConstantProfile(), *(MaternProfi
 every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda p: f"{type(p).__name__}{getattr(p, 'nu', '')}")
 needs_llvmlite = pytest.mark.skipif(find_spec("llvmlite") is None, reason="llvmlite is not installed")
 torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled", pytest.param("fused", marks=needs_llvmlite)])
+
+
+class Formulated(Profile):
+    """A profile of a user: a function of r2, of which fields need no derivative."""
+
+    name = "formulated"  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.function = function
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        return self.function(r2)
 
 
 def representable(*shape: int, seed: int) -> Tensor:

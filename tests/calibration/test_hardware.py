@@ -58,7 +58,7 @@ def test_predicted_deviations_hold(ur10: Case) -> None:
 
 def test_gross_errors_are_not_invented(ur10: Case) -> None:
     assert len(ur10.result.outliers) <= 0.02 * len(ur10.train)
-    assert ur10.result.leave_one_out.rms == pytest.approx(ur10.held_out()[2], rel=0.25)
+    assert ur10.result.left_out_rms == pytest.approx(ur10.held_out()[2], rel=0.25)
 
 
 @pytest.mark.parametrize("poses", FEWER)

@@ -12,6 +12,7 @@ import again_bank
 import pytest
 import torch
 from again_bank import CASES, Again
+from kind_bank import kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
@@ -80,6 +81,19 @@ def test_rows_of_a_fit_linearised_around_it_lead_to_it() -> None:
     torch.testing.assert_close((A.mT @ pull[:, :, None])[:, :, 0], end, rtol=1e-6, atol=1e-6 * float(end.abs().max()))
 
 
+def test_old_rows_of_readings_keep_their_payloads() -> None:
+    """Heights are linear in the points: rows linearised around the fit are the measured ones but for each plane."""
+    model = again_bank.model(again_bank.laden_height)
+    away = model.map.linearised_rows()[1] - model.map.measured()
+    for device in range(3):  # devices take turns
+        own = away[device::3]
+        torch.testing.assert_close(own, own.mean().expand_as(own), rtol=0, atol=1e-6)
+    again = dc.recalibrate(model, again_bank.laden_height(ARM, 30, 5)).model
+    for mass in (0.0, 10.0):
+        old, new = (again_bank.true_error(one.with_payload(mass), ARM, mass) for one in (model, again))
+        assert new < 1.1 * old
+
+
 def test_two_models_of_readings_are_compared() -> None:
     model = again_bank.model(again_bank.height)
     found = dc.compare(model, model, count=100)
@@ -104,6 +118,22 @@ def test_a_recalibrated_model_keeps_its_tool() -> None:
     found = dc.recalibrate(model, again_bank.positions(ARM, 12, 5)).model
     assert torch.equal(found.tool, tool)
     assert found.tool_tip == ARM.nominal.tip
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_recalibrated_model_keeps_its_devices(seen: bool) -> None:
+    """Beside the robot in the new frame; where new rows see them as these say: one that has moved by 3 mm does so."""
+    kind = kind_named("several kinds")
+    model, rows, q = kind.model, kind.moved, kind.q(30)
+    positions, heights = (part for part in rows.parts if part.kind in ("position", "height"))
+    new = dc.Observations.joined([positions, replace(heights, values=heights.values + 3e-3)]) if seen else positions
+    again = dc.recalibrate(model, new).model
+    before, after = model.predict_readings(q), again.predict_readings(q)
+    assert [(one.kind, one.device) for one in after] == [(one.kind, one.device) for one in before]
+    for one, other in zip(before, after, strict=True):
+        further = 3.0 * (seen and one.kind == "height")
+        allowed = 5 * (one.deviations.square() + other.deviations.square()).sqrt()
+        assert bool(((other.mean - one.mean - further).abs() < allowed)[one.mean.isfinite()].all()), one.device
 
 
 def test_a_session_that_deviates_is_a_change_and_no_outliers() -> None:

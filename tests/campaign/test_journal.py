@@ -16,8 +16,8 @@ import pytest
 from command_bank import PROGRAM, Command
 
 import diffeo_calib as dc
+from diffeo_calib.campaign.feeds import parsed
 from diffeo_calib.campaign.journal import GrowingTable, Journal
-from diffeo_calib.cli.commands.campaign import append_row
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -88,16 +88,30 @@ def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
         table.new_lines()
 
 
-def test_rows_as_json_are_appended_whole(tmp_path: Path) -> None:
+def test_rows_are_appended_whole(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
-    append_row(path, '{"a": 1.5, "b": "s"}\n', ";", ",")
-    path.write_bytes(path.read_bytes() + b"7;")  # torn by a crash
-    append_row(path, '{"b": "t", "a": -2e-05}\n', ";", ",")
-    assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n"
-    for bad in ('{"a": 1', '{"a": 1}', "[1]\n", "{}\n", '{"c": 1}\n'):
-        with pytest.raises(InputError):
-            append_row(path, bad, ";", ",")
-    assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n"
+    table = GrowingTable(path, ";", ",")
+    table.append(*table.written({"a": 1.5, "b": "s"}))
+    path.write_bytes(path.read_bytes() + b"7;")  # another program, or torn by a crash
+    assert table.new_lines() == [b"1,5;s\n"]
+    with pytest.raises(InputError, match="another program"):
+        table.append(*table.written({"a": 2}))
+    table.repair()
+    table.append(*table.written({"b": "t", "a": -2e-05}))
+    table.append(*table.written({"a": None, "b": 3}))
+    assert table.new_lines() == [b"-2e-05;t\n", b";3\n"]
+    with pytest.raises(InputError, match="columns c"):
+        table.written({"a": 1, "c": 2})
+    assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n;3\n"
+
+
+@pytest.mark.parametrize(
+    "bad", [b'{"a": 1', b'{"a": 1}', b"[1]\n", b"1\n", b'{"a": NaN}\n', b'{"a": [1]}\n', b'{"a": "x\\n"}\n', b"\xff\n"]
+)
+def test_lines_that_are_no_rows(bad: bytes) -> None:
+    with pytest.raises(InputError, match="a line of JSON"):
+        parsed(bad)
+    assert parsed(b'{"a": 1.5, "b": null, "c": "x"}\n') == {"a": 1.5, "b": None, "c": "x"}
 
 
 def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[str], command: Command) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from queue import Queue
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -14,9 +15,8 @@ import pytest
 import torch
 
 import diffeo_calib as dc
-from diffeo_calib.cli.commands.campaign import state_of
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.live import Page, served
+from diffeo_calib.reports.live import Page, served, state_of
 from diffeo_calib.robots import SimulatedArm
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -32,9 +32,15 @@ def answer(page: Page, method: str, path: str, **headers: str) -> int:
     return status
 
 
+def decided(page: Page) -> list[tuple[str, int]]:
+    """What two buttons decided."""
+    both = page.decisions.get(timeout=5), page.decisions.get(timeout=5)
+    return [(one.entry["do"], one.entry["row"]) for one in both if one is not None and isinstance(one.entry, dict)]
+
+
 @pytest.fixture
 def page() -> Iterator[Page]:
-    with served("0") as running:
+    with served("0", Queue()) as running:
         yield running
 
 
@@ -50,11 +56,11 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
     assert page.decisions.empty()
     assert answer(page, "POST", "/reject?row=3", **mine) == 200
     assert answer(page, "POST", "/accept?row=4", **mine) == 200
-    assert [page.decisions.get(), page.decisions.get()] == [(3, False), (4, True)]
+    assert decided(page) == [("reject", 3), ("accept", 4)]
 
 
 def test_another_address_needs_the_token() -> None:
-    with served("0.0.0.0:0") as page:
+    with served("0.0.0.0:0", Queue()) as page:
         assert answer(page, "GET", "/") == answer(page, "GET", "/?token=wrong") == 403
         assert answer(page, "GET", "/events?token=") == 403
         assert answer(page, "GET", f"/?token={page.token}") == 200
@@ -62,7 +68,7 @@ def test_another_address_needs_the_token() -> None:
 
 def test_an_address_that_is_no_address_is_refused(page: Page) -> None:
     for address in ("x", "70000", f"{urlsplit(page.url).port}", "no-such-host.invalid:0"):
-        with pytest.raises(InputError), served(address):
+        with pytest.raises(InputError), served(address, Queue()):
             pass
 
 
@@ -87,14 +93,16 @@ def campaign() -> dc.Campaign:
 
 
 def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
-    state = json.loads(json.dumps(state_of(campaign, "0.5 mm expected; next: 1, 2", 1e-4), allow_nan=False))
+    state = json.loads(
+        json.dumps(state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4), allow_nan=False)
+    )
     assert state["state"] == "15 of 16 rows accepted; 0.5 mm expected"
     assert [one["row"] for one in state["verdicts"]] == list(range(15, 7, -1))
     assert len(state["done"]) == 16
     assert len(state["links"]) == 7
     empty = dc.Campaign(ARM.nominal)
     empty.add(torch.zeros(6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    assert state_of(empty, "no model yet", None)["error"] is None
+    assert state_of(empty, ("no model yet", ""), None, None)["error"] is None
 
 
 @pytest.mark.slow
@@ -102,7 +110,7 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
 def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, scheme: Any) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
-    state = state_of(campaign, "0.5 mm expected; next: 1, 2", 1e-4)
+    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4)
     root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
@@ -128,7 +136,7 @@ def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, sc
         with seen.expect_response("**/accept?**"):
             seen.focus("button[data-row='14']")
             seen.keyboard.press("Enter")
-        assert [page.decisions.get(timeout=5), page.decisions.get(timeout=5)] == [(15, False), (14, True)]
+        assert decided(page) == [("reject", 15), ("accept", 14)]
         seen.reload()
         seen.wait_for_selector("li")
         page.publish(state | {"error": 0.123})

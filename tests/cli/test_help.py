@@ -7,11 +7,12 @@ from command_bank import Command
 
 TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
 POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--camera-on-tool", "--std", "--rotation-std"]
+DRIFT = ["--time", "--temperature"]
 SOCKETS = ["--socket", "--distance", "--distance-std"]
 JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
-        *("CSV", "--robot", "--base", "--tip", *SOCKETS, "--reading", "--load", "--session", "--payload"),
+        *("CSV", "--robot", "--base", "--tip", *SOCKETS, "--reading", "--load", "--session", "--payload", *DRIFT),
         *(*TABLE, *POSES),
         *(
             "-o",
@@ -28,11 +29,35 @@ OPTIONS = {
         ),
     ],
     "campaign": [
-        *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session"),
-        *("--payload", "--target", "--stdin", "--once", "--candidates", "--page", "--next", "--accepted"),
+        *("CSV", "--robot", "--base", "--tip", "--load", *TABLE, *POSES, *SOCKETS, "--reading", "--session", *DRIFT),
+        *(
+            "--payload",
+            "--target",
+            "--stdin",
+            "--listen",
+            "--token",
+            "--json-lines",
+            "--once",
+            "--candidates",
+            "--page",
+            "--next",
+            "--accepted",
+        ),
     ],
     "evaluate": [
-        *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),
+        *(
+            "MODEL",
+            "CSV",
+            *SOCKETS,
+            "--reading",
+            "--session",
+            *TABLE,
+            *POSES,
+            "--payload",
+            *DRIFT,
+            "--register",
+            "--free",
+        ),
         *JUDGED,
     ],
     "init": ["CSV", "URDF", "-o", "--output", "--force"],
@@ -64,6 +89,7 @@ OPTIONS = {
             "--reading",
             "--session",
             "--payload",
+            *DRIFT,
             "-o",
             "--output",
             "--marker",
@@ -73,11 +99,11 @@ OPTIONS = {
         ),
     ],
     "compare": [
-        *("OLD", "OTHER", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload"),
+        *("OLD", "OTHER", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload", *DRIFT),
         *("--marker", "--level", "--seed", "--figure"),
     ],
     "report": [
-        *("MODEL", "-o", "--output", "--data", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload"),
+        *("MODEL", "-o", "--output", "--data", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload", *DRIFT),
         *("--title", "--against", "--tolerance"),
     ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],

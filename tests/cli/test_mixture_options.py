@@ -71,9 +71,9 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
     data = read()
     assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
-    spread = json.loads(Path("e.json").read_text())["results"]["errors"]["in_sockets"]["all"]
-    assert spread["rows"] == 12
-    assert spread["rms_m"] == pytest.approx(dc.evaluate(model, data.socket_rows()).rms, rel=1e-9)
+    spread = json.loads(Path("e.json").read_text())["results"]["kinds"]["socket"]["all"]
+    assert (spread["rows"], spread["what"], spread["unit"]) == (12, "spread", "mm")
+    assert spread["rms"] == pytest.approx(1e3 * dc.evaluate(model, data.socket_rows()).rms, rel=1e-9)
     (folder / "tracked.csv").write_text(
         "\n".join(line for line in (folder / "t.csv").read_text().split("\n") if not line.startswith("spot"))
     )
@@ -195,7 +195,7 @@ def test_set_ups_are_evaluated_each_in_its_place(
         written.append(json.loads(Path("e.json").read_text())["results"])
     assert "the frames of 2 sessions were found from these rows, 12 numbers in all" in " ".join(done.out.split())
     still, placed = written
-    assert placed["errors"]["in_sockets"] == still["errors"]["in_sockets"]
+    assert placed["kinds"]["socket"] == still["kinds"]["socket"]
     assert placed["errors"]["all"]["rows"] == TRACKED
     assert placed["errors"]["all"]["rms_m"] <= still["errors"]["all"]["rms_m"]
     a, b = (torch.tensor(placed["session_transforms"][name], dtype=torch.float64) for name in "ab")

@@ -50,7 +50,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert expected["diffeomorphic"] < expected["geometry"] < expected["nominal + registration"]
     first = f"nominal + registration {1e3 * expected['nominal + registration']:.3f}"
     assert f"expected absolute error by stage, in mm: {first}" in " ".join(fitted.out.split())
-    held_out = found["reading_errors"]["held_out"]
+    held_out = found["kinds"]["distance"]["held_out"]
     assert held_out["diffeomorphic"]["rms"] < held_out["geometry"]["rms"]
     assert held_out["diffeomorphic"]["unit"] == "mm"
     done = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--json", "e.json")
@@ -60,7 +60,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert isinstance(model, dc.CalibratedKinematics)
     assert model.provenance is not None
     assert model.provenance.command.startswith("diffeo-calib fit t.csv")
-    rms = json.loads(Path("e.json").read_text())["results"]["reading_errors"]["all"]["rms"]
+    rms = json.loads(Path("e.json").read_text())["results"]["kinds"]["distance"]["all"]["rms"]
     assert 0 < rms < held_out["nominal + registration"]["rms"]
     strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
     assert strict.code == 4

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
+import threading
+import time
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 from math_bank import normal, torch_threads
-from sum_bank import assert_same, every_formula, every_profile, mapped, points
+from sum_bank import Formulated, assert_same, every_formula, every_profile, mapped, points
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -114,10 +119,20 @@ def test_the_exponential_is_exact_to_rounding(dtype: torch.dtype, error: float) 
 
 
 def test_points_that_are_not_finite_are_seen() -> None:
-    for value in (float("nan"), float("inf")):
+    unusual = torch.tensor(0x7FF80000000007A2).view(torch.float64)  # NaN with other bits, such as R's "not available"
+    for value in (float("nan"), float("inf"), unusual):
         j = points(40, 2)
         j.features[7, 1] = value
         assert all(bool(t.isnan().any()) for t in fused(FULL, GaussianProfile(), None, j))
+        assert bool(fused(FIELD, GaussianProfile(), None, j)[0][7].isnan().all())
+
+
+@pytest.mark.parametrize("nu", [1.5, 2.5, 3.5])
+def test_points_that_are_far_away_add_nothing(nu: float) -> None:
+    """A large polynomial times an exponential that is zero, not the smallest number."""
+    i, j = points(4, 1), points(30, 2)
+    i.features[:] = 1e100
+    assert not any(bool(t.any()) for t in fused(GRADIENT, MaternProfile(nu), i, j))
 
 
 # --- Profiles of a user ------------------------------------------------------------------------------------------
@@ -165,20 +180,32 @@ def test_a_changed_parameter_is_noticed() -> None:
         assert_same(found, Dense().reduce(FIELD, profile, None, j), 1e-12)
 
 
+def test_a_number_from_elsewhere_is_noticed_when_it_changes() -> None:
+    """Profiles may read constants of their class or module, or the contents of an object."""
+    numbers: dict[str, float] = {}
+    backend, profile, j = Fused(), Formulated(lambda r2: (-(r2 * numbers["alpha"])).exp()), points(30, 2)
+    for numbers["alpha"] in (0.3, 0.9):
+        found = backend.reduce(FIELD, profile, None, j)
+        assert found is not None
+        assert_same(found, Dense().reduce(FIELD, profile, None, j), 1e-12)
+
+
 def test_a_profile_that_is_optimised_is_not_compiled_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sums, "MOST_VARIANTS", 2)
     backend, j = Fused(), points(30, 2)
-    found = [backend.reduce(FIELD, Own(0.1 * k), None, j) for k in range(1, 5)]
-    assert [f is None for f in found] == [False, False, True, True]
+    found = [backend.reduce(FIELD, Own(0.1 * k), None, j) for k in (1, 2, 3, 4, 1)]
+    assert [f is None for f in found] == [False, False, True, True, False]
 
 
 def test_what_cannot_be_compiled_is_left_to_others() -> None:
     j = points(30, 2)
     assert Fused().reduce(FIELD, Decorated(), None, j) is None
     wide = j._replace(momenta=normal(30, sums.MOST_OUTPUTS + 1, seed=1))
-    assert Fused().reduce(FIELD, GaussianProfile(), None, wide) is None
-    expected = Dense().reduce(FIELD, GaussianProfile(), None, wide)
-    assert_same(backends.evaluate(FIELD, GaussianProfile(), None, wide, "fused"), expected, 1e-12)
+    long = j._replace(features=normal(30, sums.MOST_INPUTS, seed=1))  # 2500 coordinates would take minutes
+    for unusual in (wide, long):
+        assert Fused().reduce(FIELD, GaussianProfile(), None, unusual) is None
+        expected = Dense().reduce(FIELD, GaussianProfile(), None, unusual)
+        assert_same(backends.evaluate(FIELD, GaussianProfile(), None, unusual, "fused"), expected, 1e-12)
 
 
 # --- Compiling ----------------------------------------------------------------------------------------------------
@@ -221,6 +248,64 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
         sums._reason.cache_clear()
+
+
+def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor would a full disk become fuller with every process."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(sums, "machine", cache(sums.Machine))
+    fused(FIELD, GaussianProfile(), None, points(30, 2))
+    assert list((tmp_path / "diffeo_calib" / "fused").iterdir()) == []
+
+
+def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The functions of a second one would end with it, and the process with them."""
+    monkeypatch.setattr(sums, "_machine", cache(lambda: time.sleep(0.05) or object()))
+    found: list[object] = []
+    threads = [threading.Thread(target=lambda: found.append(sums.machine())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(one is sums.machine() for one in found)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_a_process_forked_while_a_thread_compiles_can_compile() -> None:
+    held, compiled = threading.Event(), threading.Event()
+
+    def compiling() -> None:
+        with sums.LOCK:
+            held.set()
+            compiled.wait(0.1)
+
+    thread = threading.Thread(target=compiling)
+    thread.start()
+    assert held.wait(5.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside threads, from Python 3.12 on
+        child = os.fork()
+    if child == 0:
+        os._exit(0 if sums.LOCK.acquire(timeout=2.0) else 1)
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_many_rows_of_few_columns_run_in_a_few_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part for every tile would take longer to hand to a thread than to compute."""
+    parts: list[int] = []
+    in_parallel = sums.in_parallel
+    monkeypatch.setattr(sums, "in_parallel", lambda f, p: parts.append(len(p)) or in_parallel(f, p))
+    i, j = points(1000, 1), points(sums.LARGE_PAIRS // 1000 + 1, 2)
+    assert_same(fused(FIELD, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-11)
+    fused(FIELD, GaussianProfile(), j, i)
+    assert len(parts) == 2
+    assert max(parts) <= sums.PARTS
 
 
 def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:

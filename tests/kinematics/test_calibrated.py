@@ -132,7 +132,7 @@ def elastic_columns(case: Case, q: Tensor) -> Tensor:
     columns = []
     for family in elasticity.compliances:
         size = scales.compliance if family.own else scales.lateral_compliance
-        effect = twists[:, :, family.joint] @ family.direction * size[family.joint]
+        effect = twists[:, :, family.joint] @ torch.from_numpy(family.direction) * size[family.joint]
         for k in range(family.size):
             usual = effect * scales.gravity[k % 3]
             deviation = float(size[family.joint] * scales.gravity[k % 3])

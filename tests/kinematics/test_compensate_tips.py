@@ -16,7 +16,7 @@ from two_arms_bank import HANDS, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.targets import Targets, TargetsOfTips
+from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -168,15 +168,14 @@ def test_targets_of_tips_are_those_of_each(kind: str) -> None:
     jacobian, free = rng.standard_normal((6, 2, 6, 4)), np.zeros((6, 2), dtype=bool)
     free[1, 0] = free[4, 1] = True
 
-    def one(poses: np.ndarray) -> Targets:
+    def goals(poses: np.ndarray) -> Targets:
         if kind == "poses":
-            return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=0.3)
-        axis = {"axis": poses[:, :3, 1], "tool_axis": np.array([0.0, 0.0, 1.0])} if kind == "axis" else {}
-        return Targets(poses[:, :3, 3], **axis, lever=0.3)
+            return Targets(poses[..., :3, 3], rotation=poses[..., :3, :3], lever=0.3)
+        axis = {"axis": poses[..., :3, 1], "tool_axis": np.array([0.0, 0.0, 1.0])} if kind == "axis" else {}
+        return Targets(poses[..., :3, 3], **axis, lever=0.3)
 
-    flat = one(wanted.reshape(-1, 4, 4))
-    both = TargetsOfTips(flat.position, flat.rotation, flat.axis, flat.tool_axis, flat.lever, free=free)
-    hands = [one(wanted[:, k]) for k in range(2)]
+    both = replace(goals(wanted), free=free)
+    hands = [goals(wanted[:, [k]]) for k in range(2)]
     counts = [~free[:, k] for k in range(2)]
 
     def total(values: list[np.ndarray]) -> np.ndarray:
@@ -186,17 +185,17 @@ def test_targets_of_tips_are_those_of_each(kind: str) -> None:
         kept = [np.where(c.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0) for c, v in zip(counts, values, strict=True)]
         return np.concatenate(kept, axis=1)
 
-    np.testing.assert_array_equal(both.cost(seen), total([h.cost(seen[:, k]) for k, h in enumerate(hands)]))
-    bent = [h.curvature(jacobian[:, k], seen[:, k]) for k, h in enumerate(hands)]
+    np.testing.assert_array_equal(both.cost(seen), total([h.cost(seen[:, [k]]) for k, h in enumerate(hands)]))
+    bent = [h.curvature(jacobian[:, [k]], seen[:, [k]]) for k, h in enumerate(hands)]
     np.testing.assert_allclose(both.curvature(jacobian, seen), total(bent), rtol=1e-13)
-    errors = [h.errors(seen[:, k]) for k, h in enumerate(hands)]
+    errors = [h.errors(seen[:, [k]]) for k, h in enumerate(hands)]
     np.testing.assert_array_equal(both.errors(seen), beside(errors))
-    slopes = [h.slopes(jacobian[:, k], seen[:, k]) for k, h in enumerate(hands)]
+    slopes = [h.slopes(jacobian[:, [k]], seen[:, [k]]) for k, h in enumerate(hands)]
     np.testing.assert_array_equal(both.slopes(jacobian, seen), beside(slopes))
     apart = [h.independent(e) for h, e in zip(hands, errors, strict=True)]
     np.testing.assert_allclose(both.independent(both.errors(seen)), beside(apart), rtol=0, atol=1e-15)
     for rows in (np.array([4, 1]), np.any(free, axis=1)):
         np.testing.assert_array_equal(both.take(rows).cost(seen[rows]), both.cost(seen)[rows])
         assert len(both.take(rows)) == 2
-    assert both.pose_shape == (2, 4, 4)
-    assert len(replace(both)) == 6
+    assert both.tools == 2
+    assert len(both) == 6

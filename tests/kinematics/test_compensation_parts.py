@@ -80,12 +80,12 @@ def random_poses(rows: int, seed: int) -> Array:
 
 
 def targets(kind: str, rows: int) -> Targets:
-    poses = random_poses(rows, 3)
+    poses = random_poses(rows, 3)[:, None]
     if kind == "poses":
-        return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=0.3)
+        return Targets(poses[..., :3, 3], rotation=poses[..., :3, :3], lever=0.3)
     if kind == "axis":
-        return Targets(poses[:, :3, 3], axis=poses[:, :3, 1], tool_axis=np.array([0.0, 0.0, 1.0]), lever=0.3)
-    return Targets(poses[:, :3, 3])
+        return Targets(poses[..., :3, 3], axis=poses[..., :3, 1], tool_axis=np.array([0.0, 0.0, 1.0]), lever=0.3)
+    return Targets(poses[..., :3, 3])
 
 
 @pytest.mark.parametrize("kind", ["poses", "axis", "positions"])
@@ -98,13 +98,13 @@ def test_gradient_and_hessian_of_the_cost(kind: str, name: str) -> None:
     goal = targets(kind, rows)
 
     def cost(at: Array) -> Array:
-        return goal.cost(chain.poses(at)[:, 0])
+        return goal.cost(chain.poses(at))
 
     def slope(at: Array) -> Array:
-        poses, J = (found[:, 0] for found in chain.poses_and_jacobian(at))
+        poses, J = chain.poses_and_jacobian(at)
         return -np.einsum("nkj,nk->nj", goal.slopes(J, poses), goal.errors(poses))
 
-    poses, J = (found[:, 0] for found in chain.poses_and_jacobian(q))
+    poses, J = chain.poses_and_jacobian(q)
     S = goal.slopes(J, poses)
     hessian = S.swapaxes(1, 2) @ S + goal.curvature(J, poses)
     for joint in range(n):
@@ -116,12 +116,12 @@ def test_gradient_and_hessian_of_the_cost(kind: str, name: str) -> None:
 
 
 def test_misses_are_distances_and_angles() -> None:
-    goal, poses = targets("poses", 5), random_poses(5, 4)
+    goal, poses = targets("poses", 5), random_poses(5, 4)[:, None]
     distance, angle = goal.misses(poses)
     assert angle is not None
     assert goal.rotation is not None
-    np.testing.assert_allclose(distance, np.linalg.norm(poses[:, :3, 3] - goal.position, axis=1), atol=1e-14)
-    traces = np.trace(poses[:, :3, :3] @ goal.rotation.swapaxes(1, 2), axis1=1, axis2=2)
+    np.testing.assert_allclose(distance, np.linalg.norm(poses[..., :3, 3] - goal.position, axis=2), atol=1e-14)
+    traces = np.trace(poses[..., :3, :3] @ goal.rotation.swapaxes(2, 3), axis1=2, axis2=3)
     np.testing.assert_allclose(angle, np.arccos((traces - 1) / 2), atol=1e-10)
 
 
@@ -172,7 +172,7 @@ def test_torch_and_numpy_find_the_same_commands(arm: Case, monkeypatch: pytest.M
     q = arm.test.q[:10]
     targets = arm.robot(q)
     found = dc.compensate(arm.model.with_tool(None), targets, q)
-    monkeypatch.setattr("diffeo_calib.kinematics.compensation.kinematics.program_of", lambda _: None)
+    monkeypatch.setattr("diffeo_calib.kinematics.tool.program_of", lambda _: None)
     monkeypatch.setattr("diffeo_calib.kinematics.tool.program_of", lambda _: None)
     again = dc.compensate(arm.model.with_tool(None), targets, q)
     assert found.status == again.status

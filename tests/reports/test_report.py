@@ -138,14 +138,14 @@ def test_rows_of_the_fit_are_seen_from_its_own_frame(arm: Case, tmp_path: Path) 
     table = table.with_line_numbers([2 + row for row in range(len(away))])
     result = dc.calibrate(arm.robot, table, hyperparameters=usual_scales(arm.robot))
     found = made(tmp_path / "report.html", result.model, table)
-    assert found.errors["calibrated"].rms < 2.0 * result.leave_one_out.rms
+    assert found.errors["calibrated"].rms < 2.0 * result.left_out_rms
     assert found.predictions.data.line_numbers[0] == 2
     unseen = arm.test[:SHOWN]
     new = dc.Measurements(unseen.q, unseen.points + torch.tensor([0.3, -0.1, 0.2]), arm.robot.joint_names)
     new = new.with_sessions(["tuesday"] * len(new))
     for rows in (new, result.aligned(new)):
         found = made(tmp_path / "new.html", result.model, rows)
-        assert found.errors["calibrated"].rms < 2.0 * result.leave_one_out.rms
+        assert found.errors["calibrated"].rms < 2.0 * result.left_out_rms
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -67,7 +67,8 @@ NEW_SET_UP = "name the set-ups in a column (`session`), or use the rows before o
 TWO_ROBOTS = "calibrate the rows before it, and recalibrate that model with the rows after it"
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
-    "measure in random order, so that the drift averages out"
+    "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
+    "then drifts"
 )
 
 
@@ -201,7 +202,7 @@ def change_during(
     return sentence(
         f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
         expected="one set-up for all rows, in the order of their numbers",
-        got=f"leave-one-out errors of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with this change in the model",
+        got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
         fix=SLOW if best.drifts else f"check what happened then; {best.cause.fix}",
     )
 

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_direction
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherRows, Placement, seen_rows
 from diffeo_calib.calibration.placing.readings import (
@@ -43,7 +44,9 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
@@ -169,13 +172,16 @@ class Placed:
         balls = self.lever is None and bool(self.readings)
         return self.free or balls or self.placement.one(SocketDevices) is not None
 
-    @property
-    def positions(self) -> Tensor | None:
-        """(M,) numbers of the rows whose positions a device measured; None where all rows are of one kind."""
-        if self.free or self.coordinates is None:
-            return None
-        seen = self.coordinates.rows[self.coordinates.table.places < 0]
-        return None if len(seen) == len(self.data) else seen
+    def by_kind(self, errors: Tensor) -> Evaluations:
+        """Errors (N, R) of the numbers of the rows, m, NaN where nothing was measured, in the unit of each kind."""
+        return errors_of_kinds(errors, self.coordinates, self.readings)
+
+    def shown(self, row: Any) -> tuple[str, float]:
+        """Unit in which errors of a row, a table of its own, are shown, and how many of it are a metre at the tool."""
+        for one in self.readings:
+            if one.data.kind == row.kind:
+                return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
+        return shown_unit("m")
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
@@ -191,18 +197,13 @@ class Placed:
             own = own._replace(table=table)
         return replace(self, placement=placement, coordinates=own)
 
-    def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
-        """RMS errors, m, of registration, geometry and a model: of coordinates if there are any, else of readings."""
+    def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float | None]:
+        """RMS errors, m, of registration, geometry and a model in measured positions; None without any."""
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
-        if self.coordinates is not None:
-            places = Places(ball=self.ball)
-            return [residuals(stage, places, self.coordinates.table).main.rms for stage in kinematics]
-        found = []
-        for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
-            pairs = zip(devices, self.readings, strict=True)
-            errors = [own.errors(one.data, own.points_of(stage(one.data.q).detach())) for own, one in pairs]
-            found.append(float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt()))
-        return found
+        if self.coordinates is None:
+            return [None] * len(kinematics)
+        places = Places(ball=self.ball)
+        return [residuals(stage, places, self.coordinates.table).positions_rms for stage in kinematics]
 
     @property
     def devices_by_stage(self) -> list[tuple[Devices, ...]]:
@@ -220,6 +221,11 @@ class Placed:
         seen = seen_rows(data)
         return replace(data, shared=self.placement.shared(seen), held=held)
 
+    def drifting(self) -> Placed | None:
+        """The same with what may drift with columns of the table; None without such columns."""
+        drift = Drift.of_table(self.data, self.registration.geometry.chain)
+        return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
+
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.
 
@@ -231,7 +237,7 @@ class Placed:
         """
         coordinates, readings = divided(data)
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
-        other = OtherRows(coordinates, readings, len(data), centre)
+        other = OtherRows(data, coordinates, readings, len(data), centre)
         placement = Placement(tuple(one.with_rows(other) for one in self.placement))
         if coordinates is not None:
             table = placement.aligned(coordinates.table)

@@ -56,10 +56,11 @@ class OtherRows(NamedTuple):
     """Rows of devices that are known, as they were measured.
 
     Args:
-        coordinates: those that tell coordinates. readings: the others, by kind. count: of all.
+        data: all of them. coordinates: those that tell coordinates. readings: the others, by kind. count: of all.
         centre: (3,) the middle of the rows with which the devices were found, m.
     """
 
+    data: Any
     coordinates: Coordinates | None
     readings: list[OtherReadings]
     count: int
@@ -117,8 +118,8 @@ class DeviceSet(ABC):
         return table
 
     @abstractmethod
-    def placed(self) -> PlacedDevices:
-        """What a model keeps of them."""
+    def placed(self) -> PlacedDevices | None:
+        """What a model keeps of them; None for nothing."""
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -213,7 +214,7 @@ class Placement:
 
     def placed(self) -> tuple[PlacedDevices, ...]:
         """What a model keeps of all devices."""
-        return tuple(own.placed() for own in self.sets)
+        return tuple(found for own in self.sets if (found := own.placed()) is not None)
 
 
 def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:

@@ -390,7 +390,8 @@ def groups_of(rows: NewRows) -> dict[str, Group]:
 
 def _unknown(rows: NewRows, where: str, level: float) -> Change:
     """A change of rows that deviate together, of no part that is known."""
-    size = rows.rms(rows.residual)
+    numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
+    size = float(rows.residual.unflatten(1, (-1, numbers)).square().sum(2).mean().sqrt())  # m at the tool
     return Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
+from math import nan, sqrt
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     place_again,
     warn_of_moved_markers,
 )
-from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
+from diffeo_calib.calibration.recalibration.recalibrate import warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError
@@ -28,6 +28,7 @@ from diffeo_calib.kinematics.re_registration.register_again import find_place, w
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
+from diffeo_calib.sensors.errors import Evaluations
 
 GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
@@ -41,21 +42,24 @@ class Comparison:
     Args:
         moved: where measuring device and markers are now; None where no device measured coordinates.
         changes: what has changed in the robot itself.
-        rms: RMS distance of the rows from the model after registration, m; outliers left out.
-        expected: what the model's own uncertainty and noise lead to expect, m.
+        errors: of the rows from the model, devices and markers found anew, kind by kind and in the unit of each.
+        expectations: what the model's own uncertainty and noise lead to expect of them. Of each ``rms`` and
+            ``expected`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
     """
 
     moved: Registration | None
     changes: Changes
-    rms: float
-    expected: float
+    errors: Evaluations
+    expectations: Evaluations
+
+    rms = property(lambda self: self.errors.rms)
+    expected = property(lambda self: self.expectations.rms)
 
     def __str__(self) -> str:
         return str(self.changes)
 
     def __repr__(self) -> str:
-        errors = f"rms={self.rms:.4g} m, expected={self.expected:.4g} m"
-        return f"Comparison({errors}: {self})"
+        return f"Comparison(rms: {self.errors.rms_text}; expected: {self.expectations.rms_text}: {self})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,11 +152,10 @@ def compare(
         warn_about(found, outliers=not changes.found, excess=not changes.found)
         warn_of_moved_markers(found, marker)
     warn_of_scale(rows)
-    own = rows.posterior.diagonal() - rows.shifts.square().sum(-1).flatten()
-    noise = rows.noise.diagonal(dim1=1, dim2=2).flatten()
-    expected = (own + noise)[rows.noise_model.coordinates(rows.y).flatten()]
-    numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
-    return Comparison(found, changes, registered_rms(rows), float(numbers * expected.mean()) ** 0.5)
+    own = rows.posterior.diagonal().view(rows.y.shape) - rows.shifts.square().sum(-1)
+    deviations = (own + rows.noise.diagonal(dim1=1, dim2=2)).clamp(min=0).sqrt()
+    expected = deviations.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
+    return Comparison(found, changes, rows.by_kind(rows.placed_residual), rows.by_kind(expected))
 
 
 def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:

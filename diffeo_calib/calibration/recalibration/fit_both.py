@@ -128,7 +128,7 @@ def _shared(rows: NewRows, drifts: list[Drift]) -> tuple[Tensor, Tensor]:
     """
     old, fitted = rows.fitted, rows.before.nominal
     points = FlangePoints(fitted, fitted.geometry.tool, same=True)
-    places = old.measured() if old.slopes is None else old.geodesic(old.x)
+    places = old.measured() if old.slopes is None else old.fitted_points
     around = {"centre": rows.centre, "marker_deviation": rows.marker_deviation}
     moved = device_shifts(rows.before, points, old.x, places=places.unflatten(1, (-1, 3)), **around)
     columns = [old.noise.shared, moved if old.slopes is None else old.slopes @ moved]

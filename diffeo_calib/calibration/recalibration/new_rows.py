@@ -33,6 +33,8 @@ from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.regions import region_scale
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.sensors.coordinates import errors_of_kinds
+from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
 
 ROUNDS = 20
@@ -280,11 +282,10 @@ class NewRows:
         left = self.residual - (flat @ (flat.T @ pull)).view(self.y.shape)
         return left.masked_fill(~self.noise_model.coordinates(left), nan)
 
-    def rms(self, errors: Tensor) -> float:
-        """Root mean square length, m, of errors (M, R) of points and of readings; NaN left out."""
-        size = 3 if self.noise_model.size % 3 == 0 else self.noise_model.size
-        each = errors.unflatten(1, (-1, size))
-        return float(each.square().nansum(2)[~each.isnan().all(2)].mean().sqrt())
+    def by_kind(self, errors: Tensor) -> Evaluations:
+        """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
+        readings = [own for own in self.placement if isinstance(own, ReadingDevices)]
+        return errors_of_kinds(errors, self.before.coordinates, readings)
 
     @property
     def excess(self) -> float:

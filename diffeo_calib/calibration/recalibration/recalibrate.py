@@ -44,9 +44,10 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import warn_about
+from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.sensors.errors import Evaluations
 
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
@@ -71,9 +72,10 @@ class Recalibration:
         marker: whether the markers are the "same", have "moved" a little, or are "other" ones.
         changes: what has changed in the robot itself.
         tails: weights of the new rows; about 1 for inliers. outliers: lines of those that hardly count.
-        rms_before: RMS distance of the new rows from the old model, registered to them, m; outliers left out.
-        rms_after: the same from the new model, m.
-        left_out_rms: the same, each new row predicted by the old ones and the other new ones, m.
+        before: errors of the new rows from the old model, registered to them, kind by kind and in the unit of each.
+        after: the same from the new model.
+        left_out: the same, each new row predicted by the old ones and the other new ones. Of each ``rms_before``,
+            ``rms_after`` and ``left_out_rms`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
         inflation: factor on all variances of the old scales with which regions hold the new rows, at least one.
         fit: the exact model's fit with its certificates.
     """
@@ -85,11 +87,15 @@ class Recalibration:
     changes: Changes
     tails: Tails
     outliers: tuple[int, ...]
-    rms_before: float
-    rms_after: float
-    left_out_rms: float
+    before: Evaluations
+    after: Evaluations
+    left_out: Evaluations
     inflation: float
     fit: Fit
+
+    rms_before = property(lambda self: self.before.rms)
+    rms_after = property(lambda self: self.after.rms)
+    left_out_rms = property(lambda self: self.left_out.rms)
 
     def __repr__(self) -> str:
         return f"Recalibration({self.model!r}: {self.status})"
@@ -152,7 +158,7 @@ def recalibrate(
     progress("registration", 0, 1)
     before = place_again(model, new)
     rows = weighed(before, marker)
-    LOG.info("registration: RMS %.4f mm on %d new rows", 1e3 * registered_rms(rows), len(new))
+    LOG.info("registration: RMS %s of %d new rows", rows.by_kind(rows.placed_residual).rms_text, len(new))
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
     LOG.info("changes: %s", changes)
@@ -174,36 +180,40 @@ def recalibrate(
 
 
 def _result(
-    model: CalibratedKinematics, before: Before, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
+    model: CalibratedKinematics, place: Before, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
-    found, new = before.registration, before.data
+    found, new = place.registration, place.data
     fitted_map = fitted.model
-    if before.stands_free:
+    if place.stands_free:
         fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, robot_map(fitted_map), found.transform)
-    ball = before.new_ball or (knows_ball(model) and not _ball_measured(before))
-    after = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
+    ball = place.new_ball or (knows_ball(model) and not _ball_measured(place))
+    again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
-    rms, left_out = rows.rms(_left_over(fitted, rows)), rows.rms(rows.left_out)
+    again.placement = carried_devices(model, again, place.transform)
+    again.placement = devices_beside(again, new)
+    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.left_out))
     if model.summary is not None:
-        known = {"diffeomorphic_rms": rms, "leave_one_out_rms": left_out, "outliers": int(small.sum())}
+        known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
         certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
-        explained = {part.name: part.displacement for part in parts(after)}
-        count = len(after.configurations)
-        after.summary = replace(model.summary, **known, **certificates, rows=count, parts=explained)
+        explained = {part.name: part.displacement for part in parts(again)}
+        count = len(again.configurations)
+        again.summary = replace(
+            model.summary, **known, **certificates, outliers=int(small.sum()), rows=count, parts=explained
+        )
     return Recalibration(
-        model=after,
+        model=again,
         moved=found,
         placement=rows.placement,
         marker=next(name for name, deviation in MARKER_DEVIATIONS.items() if deviation == rows.marker_deviation),
         changes=changes,
         tails=rows.tails,
         outliers=tuple(new.line_numbers[small.to(HOST)].tolist()),
-        rms_before=registered_rms(rows),
-        rms_after=rms,
-        left_out_rms=left_out,
+        before=before,
+        after=after,
+        left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
     )
@@ -213,12 +223,6 @@ def _ball_measured(before: Before) -> bool:
     """Whether a device measured the last marker: it is no ball in an unknown place any more."""
     own = before.coordinates
     return before.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
-
-
-def registered_rms(rows: NewRows) -> float:
-    """RMS of the rows from the old model with devices and markers found anew, m; outliers left out."""
-    found = rows.before.registration
-    return rows.rms(rows.placed_residual) if found is None or rows.observe is not None else found.rms_after
 
 
 def _left_over(fitted: Fit, rows: NewRows) -> Tensor:

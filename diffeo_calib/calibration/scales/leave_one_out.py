@@ -50,16 +50,6 @@ class LeaveOneOut:
     squares: Tensor
     effective: float | None
 
-    @property
-    def rms(self) -> float:
-        """Root mean square distance, coordinates in triples, m; of single numbers by themselves."""
-        each = self.errors if self.errors.shape[1] % 3 else self.errors.unflatten(1, (-1, 3)).square().sum(-1).sqrt()
-        return float(each.square().nanmean().sqrt())
-
-    def rows(self, rows: Tensor) -> LeaveOneOut:
-        """Errors of some rows."""
-        return LeaveOneOut(self.errors[rows], self.squares[rows], self.effective)
-
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
 

@@ -11,7 +11,7 @@ from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.printed import motion_lines
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.plots.joints import comparison
@@ -37,14 +37,15 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         return
     record.add(
         changes=changes_entry(found.changes),
-        rms_m=found.rms,
-        expected_m=found.expected,
         **({} if found.moved is None else {"transform": found.moved.transform}),
+        **entries_by_kind(
+            {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
+        ),
     )
     for line in () if found.moved is None else motion_lines(found.moved, model.on):
         say(line)
-    where = "from the model, device and markers found anew"
-    say(f"RMS {1e3 * found.rms:.4f} mm {where}; {1e3 * found.expected:.4f} mm are expected")
+    say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
+    say(f"expected of it: {found.expectations.rms_text}")
     for line in change_lines(found.changes):
         say(line)
 

@@ -218,7 +218,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     """Print how far each export is from the model, and about how far from new measurements."""
     known = model.summary
     about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
-    if stands_free(model):  # errors of the fit are spreads or those of readings, which flatter
+    if about is None or stands_free(model):  # no position was measured
         about, new = ExpectedError.of(model).whole, "true positions, about"
     title = f"Distance from the model over its {len(model.configurations)} measured configurations, mm"
     table = Table(title=title, title_justify="left")
@@ -234,10 +234,9 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     if about is not None:
         table.add_row("(the model itself)", "", "", "", f"{1e3 * about:.4f}")
     out.print(table)
-    if known:
+    if known is not None and known.geometry_rms is not None and known.diffeomorphic_rms is not None:
         left = f"geometric calibration {1e3 * known.geometry_rms:.4f}, model {1e3 * known.diffeomorphic_rms:.4f}"
-        of = "spread or errors of readings" if stands_free(model) else "RMS distance from the measurements"
-        say(f"{of} of the fit, mm: {left}")
+        say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
 def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:

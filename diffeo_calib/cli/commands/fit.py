@@ -25,7 +25,7 @@ from diffeo_calib.cli.printed import (
     socket_lines,
     stage_line,
 )
-from diffeo_calib.cli.record import entries_by_kind, record
+from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
@@ -195,10 +195,12 @@ def _record(
             {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
         ),
         lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
-        leave_one_out_rms_m=result.left_out_rms,
+        leave_one_out={kind: kind_entry(one) for kind, one in result.left_out.items()},
+        leave_one_out_rms_m=result.left_out.positions_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
-            {"row": one.number, "marker": one.marker, "distance_m": one.distance, "reason": one.reason}
+            {"row": one.number, "marker": one.marker, "reason": one.reason}
+            | dict(zip(("distance", "unit"), one.shown, strict=True))
             for one in result.outliers
         ],
         base=result.model.geometry.base,
@@ -229,12 +231,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
         if held_out is not None and other is None:
             say("no row of this kind was held out: these are errors on rows that were fitted")
         if held_out is None and place == 0:
-            measured = one.one.what == ERRORS
-            left_out = f" (leave-one-out RMS {1e3 * result.left_out_rms:.4f} mm)" * measured
-            left_out *= one.one.angles is None
-            new = "poses" if measured else "rows"
-            what = f"these are errors on rows that were fitted, those of new {new} are larger{left_out}"
-            say(f"no row was held out: {what}")
+            what = "these are errors on rows that were fitted, those of new rows are larger"
+            say(f"no row was held out: {what} (leave-one-out RMS: {result.left_out.rms_text})")
 
 
 def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:

@@ -13,7 +13,7 @@ from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, placement_lines
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
@@ -46,13 +46,16 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     record.add(
         changes=changes_entry(result.changes),
         markers=result.marker,
-        rms_before_m=result.rms_before,
-        rms_after_m=result.rms_after,
-        left_out_rms_m=result.left_out_rms,
         **({} if result.moved is None else {"transform": result.moved.transform}),
         converged=result.fit.converged,
         status=result.status,
         files={"model": output},
+        **entries_by_kind(
+            {
+                kind: {"before": one, "after": result.after[kind], "left_out": result.left_out[kind]}
+                for kind, one in result.before.items()
+            }
+        ),
     )
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     frame = () if result.moved is None else frame_lines(result.moved)
@@ -73,8 +76,8 @@ def _found(result: Recalibration) -> list[str]:
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
     lines = [
         f"the markers {markers[result.marker]}",
-        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model, device and markers found anew, "
-        f"{1e3 * result.left_out_rms:.4f} mm if each is predicted by the old rows and the other new ones",
+        f"new rows, RMS from the old model, device and markers found anew: {result.before.rms_text}",
+        f"new rows, RMS if each is predicted by the old rows and the other new ones: {result.left_out.rms_text}",
     ]
     if result.outliers:
         lines.append(

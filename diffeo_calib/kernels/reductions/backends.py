@@ -140,11 +140,12 @@ def evaluate(
         the formula's results, each with M rows.
     """
     at = columns if rows is None else rows
-    if wrapped(at.features) or len(at.features) == 0 or len(columns.features) == 0:
+    tensors = at.tensors + columns.tensors
+    if wrapped(*tensors) or profile.followed or len(at.features) == 0 or len(columns.features) == 0:
         name = "dense"  # plain operations without a choice by size: torch.func, torch.compile and torch.export need it
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
-    followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
+    followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
     if accuracy is not None and name != "dense" and not followed and _finite(at, columns):

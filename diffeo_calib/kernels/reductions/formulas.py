@@ -188,6 +188,24 @@ class HessianProduct(Formula):
 FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian(), Gradient(), HessianProduct()
 
 
+class Unknown:
+    """A symbol has no value yet: comparing it raises TypeError, where Python's defaults would answer with a guess."""
+
+    __slots__ = ()
+
+    def _refuse(self, *_: object) -> Any:
+        raise TypeError("a pairwise symbol has no value to compare")
+
+    __eq__ = __ne__ = __bool__ = _refuse
+
+
+def constant(value: Any) -> float:
+    """A number that a symbol is combined with; TypeError for a tensor that autograd follows, and for what is none."""
+    if torch.is_grad_enabled() and getattr(value, "requires_grad", False):
+        raise TypeError("a pairwise symbol: expected constants, got a tensor that requires gradients")
+    return float(value)
+
+
 class MatrixPairs:
     """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd."""
 

@@ -79,8 +79,10 @@ class Keops:
         """Whether KeOps is expected to work; warns once if not."""
         return not self.failed and available()
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        """The results of a formula, M rows each; not differentiable by autograd. Rows None for the columns themselves.
+    def reduce(
+        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, M rows each, as :meth:`SumBackend.reduce`; not differentiable by autograd.
 
         Raises:
             KeopsUnavailableError: compiling or running the formula failed.
@@ -89,7 +91,10 @@ class Keops:
         keops = load()
         summands = formula.summands(columns)
         with torch.no_grad():
-            weights = formula.weights(LazyPairs(keops), profile, rows, columns)
+            try:
+                weights = formula.weights(LazyPairs(keops), profile, rows, columns)
+            except Exception:  # a profile of the user may need operations that LazyTensors lack, and raise anything
+                return None
             terms = [w * keops.Vj(b.contiguous()) for w, b in zip(weights, summands, strict=True)]
             lazy = [not isinstance(term, int) for term in terms]  # KeOps simplifies a zero weight to the number 0
             if not any(lazy):

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from math import inf, log
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ from diffeo_calib.kernels.reductions.formulas import (
     Formula,
     MatrixPairs,
     Points,
+    Unknown,
+    constant,
     distance_change_factors,
     distance_factors,
     weighted_sums,
@@ -145,9 +148,19 @@ class _Sum:
         return torch.zeros(shape, dtype=self.totals or like.dtype, device=like.device)
 
     def weights(self, rows: Points, columns: Points) -> list[Any]:
-        """The symbols w_ij of one tile; a pooled one holds its buffer while it is referenced."""
-        pairs = MatrixPairs() if self.elements is None else PooledPairs(pool_for(self.elements, rows.features))
-        return self.formula.weights(pairs, self.profile, rows, columns)
+        """The weights w_ij of one tile, matrices with a scale; a pooled one holds its buffer while it is referenced."""
+        if self.elements is not None:
+            pool = pool_for(self.elements, rows.features)
+            with suppress(Exception):  # a profile of the user may need operations that symbols lack, and raise anything
+                return self.formula.weights(PooledPairs(pool), self.profile, rows, columns)
+        return [_Plain(w) for w in self.formula.weights(MatrixPairs(), self.profile, rows, columns)]
+
+
+class _Plain(NamedTuple):
+    """A weight that is a tensor."""
+
+    matrix: Tensor
+    scale: float = 1.0
 
 
 def _symmetric(
@@ -210,10 +223,9 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
 
 
 def _sums(weights: list[Any], summands: list[Tensor]) -> list[Tensor]:
-    """Sums over one tile of tensors or pooled symbols: (k, M) each."""
-    matrices = [w.matrix if isinstance(w, Symbol) else w for w in weights]
-    scales = [w.scale if isinstance(w, Symbol) else 1.0 for w in weights]
-    return [s if c == 1.0 else s * c for s, c in zip(weighted_sums(matrices, summands), scales, strict=True)]
+    """Sums over one tile: (k, M) each."""
+    sums = weighted_sums([w.matrix for w in weights], summands)
+    return [s if w.scale == 1.0 else s * w.scale for s, w in zip(sums, weights, strict=True)]
 
 
 def _slices(count: int, size: int) -> list[slice]:
@@ -245,7 +257,7 @@ class Matrix:
         self.pool.free.append(self._buffer)
 
 
-class Symbol:
+class Symbol(Unknown):
     """scale * matrix, or scale * (left_i . right_j), not yet computed.
 
     Args:
@@ -292,7 +304,7 @@ class Symbol:
 
     def __mul__(self, other: Symbol | float) -> Symbol:
         if not isinstance(other, Symbol):
-            return Symbol(self.pool, self.scale * other, self._matrix, self._factors)
+            return Symbol(self.pool, self.scale * constant(other), self._matrix, self._factors)
         a = self._evaluated().values
         b, out = other._fresh()
         torch.mul(a, b, out=out.values)
@@ -305,7 +317,7 @@ class Symbol:
         if isinstance(other, Symbol):
             torch.add(a, other.matrix, alpha=other.scale / self.scale, out=out.values)
         else:
-            torch.add(a, other / self.scale, out=out.values)
+            torch.add(a, constant(other) / self.scale, out=out.values)
         return Symbol(self.pool, self.scale, out)
 
     def __truediv__(self, other: Symbol | float) -> Symbol:

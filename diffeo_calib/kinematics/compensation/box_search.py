@@ -48,7 +48,7 @@ def box_search(
     """Search the nearest point of every row, from ``q`` (N, n) inside the box.
 
     Returns:
-        (N, n) joint values, (N, 4, 4) poses of the tool, (N,) whether they reach the targets.
+        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
     """
     search = _Search(tool, targets, q, box, tool.poses(q) if poses is None else poses)
     for _ in range(MOST_STEPS):

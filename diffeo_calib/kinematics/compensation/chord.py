@@ -49,10 +49,9 @@ class Box:
 
 
 def reached(targets: Targets, poses: Array) -> Array:
-    """(N,) whether the tool, or each of several, is at its target."""
+    """(N,) whether each tool is at its target."""
     distance, angle = targets.misses(poses)
-    worst = distance if angle is None else np.maximum(distance, angle)
-    return worst <= REACHED if worst.ndim == 1 else np.all(worst <= REACHED, axis=1)
+    return np.all((distance if angle is None else np.maximum(distance, angle)) <= REACHED, axis=1)
 
 
 def chord_search(
@@ -64,10 +63,10 @@ def chord_search(
         tool: the kinematics.
         targets: N targets. q: (N, n) where to start, inside the box.
         box: its mobility weighs the joints of redundant robots, 0 holds a joint fixed.
-        slopes: (N, k, n) of the targets' errors at ``q``, at least roughly. poses: (N, 4, 4) of the tool at ``q``.
+        slopes: (N, k, n) of the targets' errors at ``q``, at least roughly. poses: (N, T, 4, 4) of the tools at ``q``.
 
     Returns:
-        (N, n) joint values, (N, 4, 4) poses of the tool, (N,) whether they reach the targets.
+        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
     """
     q, poses = q.copy(), poses.copy()
     done = reached(targets, poses)

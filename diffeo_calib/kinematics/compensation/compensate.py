@@ -30,17 +30,13 @@ from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.box_search import box_search, joint_limits, largest_motion, mobilities, rates
 from diffeo_calib.kinematics.compensation.chord import Box, reached
-from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions, functions_of_tips, tool_functions
+from diffeo_calib.kinematics.compensation.kinematics import tool_functions
 from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Room, Solution, Status
 from diffeo_calib.kinematics.compensation.targets import (
     Array,
-    Pointing,
     Targets,
-    TargetsOfTips,
+    checked_targets,
     finite_rows,
-    for_each_tip,
-    targets_of_tip,
-    targets_of_tips,
 )
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
@@ -173,13 +169,13 @@ def compensate(
     check_number(lever, "`lever`", above=0.0)
     wanted, robot = real_tensor(targets, "targets"), model.robot
     begin, following = _starts(start, robot, wanted)
-    goals, tips = _goals(model, wanted, len(begin), Pointing(axis, tool_axis, lever))
-    exact, rough = _tool_functions(model, tool, frame, goals)
-    limited = joint_limits(robot, limits)
+    goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
+    tools = _tools(model, tool, goals)
+    exact, rough = tool_functions(model, tools, frame)
     motion = largest_motion(robot, bound, FOLLOWING if following and bound is None else 1.0)
-    aimed = ~goals.free if isinstance(goals, TargetsOfTips) else np.ones((len(begin), 1), dtype=bool)
-    room = Room(begin, limited.low, limited.high, motion, mobilities(robot, weights, tips, aimed))
-    problem = CompensationProblem(exact, rough, goals, room, limited)
+    aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
+    room = Room(begin, joint_limits(robot, limits), motion, mobilities(robot, weights, tuple(tools), aimed))
+    problem = CompensationProblem(exact, rough, goals, room)
     pace = _pace(robot, room, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))
@@ -231,52 +227,35 @@ def _warn_of_jumps(jumps: Array) -> None:
         warn_user(sentence(what, fix=fix))
 
 
-def _goals(
-    model: CalibratedKinematics, targets: Tensor, rows: int, pointing: Pointing
-) -> tuple[Targets, tuple[str, ...]]:
-    """The checked targets, and the tips that have some."""
-    if for_each_tip(targets, model.robot):
-        return targets_of_tips(targets, rows, pointing), model.robot.tips
-    return targets_of_tip(targets, rows, pointing), (checked_tip(model.robot, model.tool_tip),)
-
-
-def _tool_functions(
-    model: CalibratedKinematics, tool: object, frame: str, goals: Targets
-) -> tuple[ToolFunctions, ToolFunctions]:
-    """Calibrated and rough kinematics of what the targets are for."""
-    if isinstance(goals, TargetsOfTips):
-        return functions_of_tips(model, _tools(model, tool), frame)
-    own = model.tool if tool is None else tool_transform(tool)
-    return tool_functions(model, own, frame, checked_tip(model.robot, model.tool_tip))
-
-
-def _tools(model: CalibratedKinematics, tool: object) -> Tensor:
-    """(T, 4, 4) tools of all tips; by default the model's own on its tip, and the other tips themselves.
+def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[str, Tensor]:
+    """Tip -> tool (4, 4) of each target; by default the model's own on its tip, and the other tips themselves.
 
     Raises:
         InputError: not one tool for every tip.
     """
     tips = model.robot.tips
+    if goals.free is None:
+        return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}
     if tool is None:
         own = model.tool_tip or tips[0]
-        return torch.stack([model.tool if tip == own else tool_transform(None) for tip in tips])
+        return {tip: model.tool if tip == own else tool_transform(None) for tip in tips}
     given = real_tensor(tool, "tool")
     if given.shape not in ((len(tips), 4, 4), (len(tips), 3)):
         expected, fix = f"({len(tips)}, 4, 4) or ({len(tips)}, 3)", "pass one tool for every tip"
         raise InputError.of("`tool` has the wrong shape", expected=expected, got=tuple(given.shape), fix=fix)
-    return torch.stack([tool_transform(each) for each in given])
+    return {tip: tool_transform(each) for tip, each in zip(tips, given, strict=True)}
 
 
 def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
-    distance, angle = problem.targets.misses(found.poses)
-    if isinstance(problem.targets, TargetsOfTips):
-        free = problem.targets.free
-        distance, angle = np.where(free, np.nan, distance), None if angle is None else np.where(free, np.nan, angle)
+    (miss, angle), poses, free = problem.targets.misses(found.poses), found.poses, problem.targets.free
+    if free is None:
+        poses, miss, angle = poses[:, 0], miss[:, 0], None if angle is None else angle[:, 0]
+    else:
+        miss, angle = np.where(free, np.nan, miss), None if angle is None else np.where(free, np.nan, angle)
     status = tuple(MEMBERS[code] for code in found.codes.tolist())
-    arrays: list[Array] = [found.q, problem.room.start.copy(), found.poses, distance]
-    q, start, poses, miss = (torch.from_numpy(array) for array in arrays)
+    q, start, seen, away = (torch.from_numpy(part) for part in (found.q, problem.room.start.copy(), poses, miss))
     turned = None if angle is None else torch.from_numpy(angle)
-    return Compensation(q, start, status, poses, miss, turned, tuple(int(row) for row in jumps))
+    return Compensation(q, start, status, seen, away, turned, tuple(int(row) for row in jumps))
 
 
 ROUNDS = 3

@@ -5,7 +5,7 @@ This is the only place of the search that knows where poses and Jacobians come f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from weakref import WeakKeyDictionary
@@ -16,10 +16,8 @@ from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array
-from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import ToolKinematics
-from diffeo_calib.robots.tree import Tree
-from diffeo_calib.runtime.build import calibrated_chain, nominal_chain
+from diffeo_calib.runtime.build import calibrated_chain
 
 SOME_LENGTH = 0.5
 """m that a radian counts as where directions of a robot without a finite reach are compared."""
@@ -29,11 +27,11 @@ MOST_TOOLS = 16
 
 @dataclass(frozen=True)
 class ToolFunctions:
-    """Kinematics of a tool centre point.
+    """Kinematics of T tool centre points.
 
     Args:
-        poses: (N, n) joint values -> (N, 4, 4) m.
-        jacobian: (N, n) -> (N, 6, n), linear then angular velocity about the axes of the frame.
+        poses: (N, n) joint values -> (N, T, 4, 4) m.
+        jacobian: (N, n) -> (N, T, 6, n), linear then angular velocity about the axes of the frame.
         serial: whether every column belongs to one joint, in the order of the chain (no mimic joints).
         length: m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach.
     """
@@ -49,70 +47,50 @@ _ready: WeakKeyDictionary[CalibratedKinematics, dict[object, tuple[ToolFunctions
 
 
 def tool_functions(
-    model: CalibratedKinematics, tool: Tensor, frame: str, tip: str
+    model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str
 ) -> tuple[ToolFunctions, ToolFunctions]:
-    """Calibrated and rough kinematics of a tool (4, 4) in a frame, "base" or "measuring", kept for later calls."""
+    """Calibrated and rough kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring".
+
+    They are kept for later calls.
+    """
     known = _ready.setdefault(model, {})
-    key = (tool.numpy().tobytes(), frame, tip)
+    key = frame, *((tip, tool.numpy().tobytes()) for tip, tool in tools.items())
     if key not in known:
         if len(known) >= MOST_TOOLS:
             known.clear()
-        known[key] = calibrated_tool(model, tool, frame, tip), rough_tool(model, tool, frame, tip)
+        robot = model.robot
+        alike = robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
+        exact, rough = _calibrated(model, tools, frame), _rough(model, tools, frame)
+        known[key] = ToolFunctions(*exact, *alike), ToolFunctions(*rough, *alike)
     return known[key]
 
 
-def functions_of_tips(model: CalibratedKinematics, tools: Tensor, frame: str) -> tuple[ToolFunctions, ToolFunctions]:
-    """The same for one tool (T, 4, 4) on each of the robot's tips: poses (N, T, 4, 4), Jacobians (N, T, 6, n)."""
-    pairs = [tool_functions(model, tool, frame, tip) for tip, tool in zip(model.robot.tips, tools, strict=True)]
-    exact, rough = zip(*pairs, strict=True)
-    return _together(exact), _together(rough)
+Functions = tuple[Callable[[Array], Array], Callable[[Array], Array]]
 
 
-def _together(tools: Sequence[ToolFunctions]) -> ToolFunctions:
-    def poses(q: Array) -> Array:
-        return np.stack([tool.poses(q) for tool in tools], axis=1)
-
-    def jacobian(q: Array) -> Array:
-        return np.stack([tool.jacobian(q) for tool in tools], axis=1)
-
-    return ToolFunctions(poses, jacobian, all(tool.serial for tool in tools), tools[0].length)
-
-
-def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: str) -> ToolFunctions:
-    """The calibrated kinematics of a tool, by constants for NumPy where the model has them."""
-    kinematics = ToolKinematics(model.map, model.nominal, tool, frame, tip)  # checks the frame
-    found, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
-    program = None if found is None else found.at(tip)
+def _calibrated(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> Functions:
+    """Poses and Jacobians of the calibrated kinematics."""
+    device = model.configurations.device
+    each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
     def poses(q: Array) -> Array:
-        if program is not None:
-            return program.poses(q, place, frame)
-        return kinematics.poses(torch.from_numpy(q).to(device)).cpu().numpy()
+        at = torch.from_numpy(q).to(device)
+        return torch.stack([tool.poses(at) for tool in each], 1).cpu().numpy()
 
     def jacobian(q: Array) -> Array:
-        if program is not None:
-            return program.poses_and_jacobian(q, place, frame)[1]
-        return kinematics.jacobian(torch.from_numpy(q).to(device)).detach().cpu().numpy()
+        at = torch.from_numpy(q).to(device)
+        return torch.stack([tool.jacobian(at) for tool in each], 1).detach().cpu().numpy()
 
-    return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n, _typical_length(model.robot))
+    return poses, jacobian
 
 
-def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: str) -> ToolFunctions:
-    """The geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
-    geometry, robot, number = model.geometry, model.robot, model.robot.tips.index(tip)
+def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> Functions:
+    """Those of the geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
+    geometry, robot = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    nominal, errors = nominal_chain(robot.to_config()), geometry.joint_errors.numpy()
-    chain = calibrated_chain(nominal, start, errors, np.zeros(6 + 6 * robot.moving), None)
-    chain = replace(chain, tips=chain.tips @ tool.numpy())
-
-    def poses(q: Array) -> Array:
-        return chain.poses(q)[:, number]
-
-    def jacobian(q: Array) -> Array:
-        return chain.poses_and_jacobian(q)[1][:, number]
-
-    return ToolFunctions(poses, jacobian, robot.moving == robot.n, _typical_length(robot))
-
-
-def _typical_length(chain: Tree) -> float:
-    return 0.25 * chain.reach if isfinite(chain.reach) else SOME_LENGTH
+    errors = geometry.joint_errors.numpy()
+    chain = calibrated_chain(robot.arrays, start, errors, np.zeros(6 + 6 * robot.moving), None)
+    numbers, ends = [robot.tips.index(tip) for tip in tools], chain.tips.copy()
+    ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
+    chain = replace(chain, tips=ends)
+    return lambda q: chain.poses(q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers]

@@ -20,7 +20,7 @@ ROWS_AT_ONCE = 4096
 
 
 class Solution(NamedTuple):
-    """Commands (N, n) in rad or m, poses of the tool (N, 4, 4) or of T tools (N, T, 4, 4), statuses' codes (N,)."""
+    """Commands (N, n) in rad or m, poses of the tools (N, T, 4, 4), statuses' codes (N,)."""
 
     q: Array
     poses: Array
@@ -33,14 +33,13 @@ class CompensationProblem:
 
     Args:
         tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets. room: the boxes. limits: of the joints, as in the room, and of mimic joints.
+        targets: N targets. room: the boxes.
     """
 
     tool: ToolFunctions
     rough: ToolFunctions
     targets: Targets
     room: Room
-    limits: Limits
 
     def take(self, rows: Array) -> CompensationProblem:
         """Some of the rows."""
@@ -67,8 +66,7 @@ class CompensationProblem:
         if nowhere.any():
             return self._without(nowhere)
         q, poses, done = self.search(box, np.clip(box.start, box.low, box.high))
-        codes = Judge(self.tool, self.rough, self.targets, self.room).codes(q, poses, done)
-        return self.keep_mimics(Solution(q, poses, codes))
+        return self.keep_mimics(Solution(q, poses, self._codes(q, poses, done)))
 
     def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:
         """The fast search from ``q`` (N, n), and the careful one for the rows that it gives up."""
@@ -83,9 +81,9 @@ class CompensationProblem:
 
     def keep_mimics(self, found: Solution) -> Solution:
         """Shorten corrections that would take mimic joints of several joints beyond their limits."""
-        if not len(self.limits.matrix):
+        if not len(self.room.limits.matrix):
             return found
-        q = self.limits.within(self.room.start, found.q)
+        q = self.room.limits.within(self.room.start, found.q)
         changed = np.flatnonzero((q != found.q).any(1))
         poses, codes = found.poses.copy(), found.codes.copy()
         codes[changed] = CODE[Status.limit]
@@ -105,101 +103,15 @@ class CompensationProblem:
         return Solution(q, poses, codes)
 
     def _no_poses(self, count: int) -> Array:
-        return np.full((count, *self.targets.pose_shape), np.nan)
+        return np.full((count, self.targets.tools, 4, 4), np.nan)
 
-
-WEAK = 0.1
-"""A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
-BENT = 0.05
-"""The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
-FARTHER = 10.0
-"""Multiple of the bound within which targets beyond the end are searched once more."""
-DIFFERENCE = 1e-4
-"""Step in rad or m of central differences of the Jacobian."""
-
-ROUNDING = 1e-15
-"""Relative; so that the difference of command and start, too, is within the bound."""
-
-
-class Status(str, Enum):
-    """How a row ended.
-
-    ``reached``: the model at the command is at the target, to 1e-9 m and 1e-9 rad.
-    ``limit``: without the limits of its joints the robot would reach the target. Change the pose or the branch.
-    ``singular``: the arm is near a singularity, where a small correction needs a larger motion than the bound allows;
-    in other directions the bound would do. Accept the miss, raise the bound, or keep away from the singularity.
-    ``unreachable``: the target is beyond the robot's reach, where the arm is stretched, for instance, or farther from
-    the start than the bound allows. Check the target, its frame and unit, the tool, and the start.
-    ``rate``: on a path, the corrections may not change fast enough to reach this row.
-
-    Rows that are not reached have the command whose miss is smallest.
-    """
-
-    reached = "reached"
-    limit = "limit"
-    singular = "singular"
-    unreachable = "unreachable"
-    rate = "rate"
-
-    def __str__(self) -> str:
-        return self.value
-
-
-MEMBERS = tuple(Status)
-CODE = {status: code for code, status in enumerate(MEMBERS)}
-
-
-@dataclass(frozen=True, eq=False)
-class Room:
-    """The parts of the boxes of N rows.
-
-    Args:
-        start: (N, n) rad or m. low: (n,) and
-        high: (n,) limits of the joints.
-        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
-    """
-
-    start: Array
-    low: Array
-    high: Array
-    bound: Array
-    mobility: Array
-
-    def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
-        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
-        start = self.start[rows]
-        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
-        low, high = start - motion, start + motion
-        if limited:
-            low, high = np.maximum(low, self.low), np.minimum(high, self.high)
-        return Box(start, low, high, self.mobility[rows])
-
-    def started(self, rows: Array, start: Array) -> Room:
-        """Of some rows (R,), from other starts (R, n)."""
-        return replace(self, start=start, mobility=self.mobility[rows])
-
-
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """Says why rows are not reached.
-
-    Args:
-        tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets. room: N boxes.
-    """
-
-    tool: ToolFunctions
-    rough: ToolFunctions
-    targets: Targets
-    room: Room
-
-    def codes(self, q: Array, poses: Array, done: Array) -> Array:
+    def _codes(self, q: Array, poses: Array, done: Array) -> Array:
         """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
         codes = np.where(done, CODE[Status.reached], CODE[Status.unreachable])
         rows = np.flatnonzero(~done)
         if not len(rows):
             return codes
-        at_limit = ((q[rows] <= self.room.low) | (q[rows] >= self.room.high)).any(1)
+        at_limit = ((q[rows] <= self.room.limits.low) | (q[rows] >= self.room.limits.high)).any(1)
         freed = rows[at_limit]
         freed = freed[self._reach(freed, limited=False)]
         codes[freed] = CODE[Status.limit]
@@ -261,3 +173,72 @@ class Judge:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
         slopes = targets.slopes(self.rough.jacobian(q), poses)
         return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound
+
+
+WEAK = 0.1
+"""A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
+BENT = 0.05
+"""The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
+FARTHER = 10.0
+"""Multiple of the bound within which targets beyond the end are searched once more."""
+DIFFERENCE = 1e-4
+"""Step in rad or m of central differences of the Jacobian."""
+
+ROUNDING = 1e-15
+"""Relative; so that the difference of command and start, too, is within the bound."""
+
+
+class Status(str, Enum):
+    """How a row ended.
+
+    ``reached``: the model at the command is at the target, to 1e-9 m and 1e-9 rad.
+    ``limit``: without the limits of its joints the robot would reach the target. Change the pose or the branch.
+    ``singular``: the arm is near a singularity, where a small correction needs a larger motion than the bound allows;
+    in other directions the bound would do. Accept the miss, raise the bound, or keep away from the singularity.
+    ``unreachable``: the target is beyond the robot's reach, where the arm is stretched, for instance, or farther from
+    the start than the bound allows. Check the target, its frame and unit, the tool, and the start.
+    ``rate``: on a path, the corrections may not change fast enough to reach this row.
+
+    Rows that are not reached have the command whose miss is smallest.
+    """
+
+    reached = "reached"
+    limit = "limit"
+    singular = "singular"
+    unreachable = "unreachable"
+    rate = "rate"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+MEMBERS = tuple(Status)
+CODE = {status: code for code, status in enumerate(MEMBERS)}
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """The parts of the boxes of N rows.
+
+    Args:
+        start: (N, n) rad or m. limits: of the joints, and of mimic joints.
+        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
+    """
+
+    start: Array
+    limits: Limits
+    bound: Array
+    mobility: Array
+
+    def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
+        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
+        start = self.start[rows]
+        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
+        low, high = start - motion, start + motion
+        if limited:
+            low, high = np.maximum(low, self.limits.low), np.minimum(high, self.limits.high)
+        return Box(start, low, high, self.mobility[rows])
+
+    def started(self, rows: Array, start: Array) -> Room:
+        """Of some rows (R,), from other starts (R, n)."""
+        return replace(self, start=start, mobility=self.mobility[rows])

@@ -159,6 +159,16 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
     return tuple(found.values())
 
 
+def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
+    """The devices of a model beside another one of the same robot, as it stands among them.
+
+    Args:
+        old, new: the models, of the same points. T: (4, 4) from the frame of the old one to that of the new one, m.
+    """
+    points = old(old.configurations).detach(), new(old.configurations).detach()
+    return tuple(own.carried(T.to(HOST), *(each.to(HOST) for each in points)) for own in old.placement)
+
+
 def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))

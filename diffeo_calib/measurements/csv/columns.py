@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -48,11 +48,17 @@ class Values(NamedTuple):
     std: Tensor | None  # (N, P, 3) m
     rotation_std: Tensor | None  # (N, T, 3) rad
     payload: Tensor | None  # (N,) in the unit of the file
+    time: Tensor | None = None  # (N,) in the unit of the file
+    temperature: Tensor | None = None  # (N,) in the unit of the file
+
+    def beside(self, rows: Any) -> Any:
+        """Rows with what the table tells of them besides joints and measured values."""
+        return rows.with_payload(self.payload).with_covariates(time=self.time, temperature=self.temperature)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns in this order: joints, positions, rotation, payload, standard deviations.
+    """The wanted columns in this order: joints, positions, rotation, covariates, payload, deviations.
 
     Args:
         table: units, and the convention of the rotation.
@@ -64,6 +70,7 @@ class Columns:
         rotation_std: names of standard deviations of rotations: one, one per frame, or three per frame.
         payload: name of the column of masses, if there is one.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
+        covariates: names of the columns with which something may drift.
         all_hidden: whether rows may show no marker, because their ball rested in a socket.
     """
 
@@ -77,6 +84,7 @@ class Columns:
     kinds_known: bool = True
     payload: tuple[str, ...] = ()
     all_hidden: bool = False
+    covariates: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -103,9 +111,10 @@ class Columns:
             () if table.payload is None else column_names("payload", [table.payload], "the name of a column", (1,))
         )
         columns = cls(table, names, prismatic, triples, rotation, std, rotation_std, kinds_known, payload)
+        columns = replace(columns, covariates=tuple(table.covariates.values()))
         twice = repeated(columns.names)
         if twice:
-            plain = not rotation and not std and not payload
+            plain = not rotation and not std and not payload and not columns.covariates
             what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
             fix = "name every column once"
             fix += ", and one that holds the deviations of all axes alone" * bool({*twice} & {*columns.deviations})
@@ -147,7 +156,7 @@ class Columns:
     def to_si(self, raw: Tensor) -> Values:
         """Convert rows (N, c) in the file's units, columns in the order of ``names``."""
         per_metre, count = self.table.per_metre, len(self.triples)
-        q, points, rotations, payload, std, rotation_std = self._parts(raw)
+        q, points, rotations, drifting, payload, std, rotation_std = self._parts(raw)
         joints = torch.where(
             self.prismatic, q / self.table.joints_per_metre, q.deg2rad() if self.table.angle == "deg" else q
         )
@@ -160,7 +169,8 @@ class Columns:
             each = 3 if len(self.rotation_std) == 3 * count else 1  # per axis or per frame
             rotations_known = rotations_known.reshape(len(raw), -1, each).expand(len(raw), count, 3)
         places, masses = (points / per_metre).reshape(len(raw), -1, 3), payload[:, 0] if self.payload else None
-        return Values(joints, places, rotations, known, rotations_known, masses)
+        covariates = dict(zip(self.table.covariates, drifting.T, strict=True))
+        return Values(joints, places, rotations, known, rotations_known, masses, **covariates)
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as rows in the file's units."""
@@ -183,13 +193,13 @@ class Columns:
         return sentences
 
     def _parts(self, raw: Tensor) -> tuple[Tensor, ...]:
-        """Split rows (N, c) into the six groups of columns."""
+        """Split rows (N, c) into the groups of columns."""
         return raw.split([len(group) for group in self._groups], dim=1)
 
     @property
     def _groups(self) -> tuple[Sequence[str], ...]:
         positions = [name for triple in self.triples for name in triple]
-        return self.joints, positions, self.rotation, self.payload, self.std, self.rotation_std
+        return self.joints, positions, self.rotation, self.covariates, self.payload, self.std, self.rotation_std
 
 
 def _check_frames(table: TableFormat, positions: int) -> None:

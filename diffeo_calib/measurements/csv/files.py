@@ -86,9 +86,9 @@ def numeric_columns(columns: TableColumns, table: TableFormat) -> Columns:
 
 
 def _laden(sensor: SensorColumns, rows: FileRows) -> Any:
-    """The rows of one kind, with their lines and payloads."""
+    """The rows of one kind, with their lines, payloads and covariates."""
     own = sensor.own_lines(rows)
-    return sensor.table(rows).with_payload(own.values.payload).with_line_numbers(own.lines)
+    return own.values.beside(sensor.table(rows)).with_line_numbers(own.lines)
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
@@ -170,6 +170,8 @@ def read_measurements(
     rotation_std: Names | None = None,
     joint_length: str | None = None,
     payload: str | None = None,
+    time: str | None = None,
+    temperature: str | None = None,
     on: Sequence[str] | None = None,
     camera_on_tool: bool = False,
     session: str | None = None,
@@ -209,6 +211,7 @@ def read_measurements(
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
         payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
             For another link see :meth:`Measurements.with_payload`.
+        time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
         camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
             deviations are along its axes; see :meth:`Measurements.from_poses`.
@@ -231,7 +234,7 @@ def read_measurements(
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
-    table = replace(table, camera_on_tool=camera_on_tool)
+    table = replace(table, camera_on_tool=camera_on_tool, time=time, temperature=temperature)
     if socket is None and (distances is not None or distance_std is not None):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     tip = None if not on or isinstance(on, str) else on[-1]

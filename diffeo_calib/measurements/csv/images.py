@@ -95,6 +95,7 @@ def image_sheet(
     values = [numeric.joints_from_si(data.q)[number], table.per_metre * points[:, :2], points[:, 3:]]
     texts: list[list[Any]] = [[str(k) for k in number.tolist()], *torch.cat(values, 1).T.tolist()]
     more = {} if data.payload is None else {table.payload or "payload": data.payload.tolist()}
+    more |= {table.covariates.get(name, name): values.tolist() for name, values in data.drifting.items()}
     more |= {session: data.device_names} if session is not None else {}
     texts += [[column[k] for k in number.tolist()] for column in more.values()]
     columns = ImageColumns((data.camera.width, data.camera.height), None, data.board is not None, session)

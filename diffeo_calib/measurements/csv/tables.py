@@ -56,7 +56,7 @@ class TableOrigin:
         one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
         one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
         one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints)}
-        one |= {"session": self.session, "sep": table.sep, "decimal": table.decimal}
+        one |= {**table.covariates, "session": self.session, "sep": table.sep, "decimal": table.decimal}
         words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
         return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
 
@@ -211,7 +211,7 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
     table = columns.table
     if table.convention is None:
         plain = Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
-        return plain.with_payload(values.payload)
+        return values.beside(plain)
 
     frames = len(columns.triples)
     numbers = values.rotations.unflatten(1, (frames, -1))
@@ -230,7 +230,7 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
         raise MeasurementError(str(error)) from None
     single = frames == 1
     std, turns = values.std, values.rotation_std
-    return Measurements.from_poses(
+    poses = Measurements.from_poses(
         values.q,
         of_frames(transforms_of_frames(rotations, values.points)),
         columns.joints,
@@ -239,7 +239,8 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
         rotation_std=turns[:, 0] if single and turns is not None else turns,
         camera_on_tool=table.camera_on_tool,
         doubt=False,
-    ).with_payload(values.payload)
+    )
+    return values.beside(poses)
 
 
 class _Signs:

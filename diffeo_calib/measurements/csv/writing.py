@@ -236,8 +236,8 @@ def write_measurements(
     """Write a CSV file that :func:`read_measurements` or :func:`read_observations` reads back; overwrites.
 
     In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations, payloads and names of set-ups and devices are written if they are known. Cells are
-    empty for hidden markers, and where a row of another kind has no value. Every row is one line.
+    float64. Standard deviations, payloads, covariates and names of set-ups and devices are written if they are known.
+    Cells are empty for hidden markers, and where a row of another kind has no value. Every row is one line.
 
     Args:
         path: the file.
@@ -246,7 +246,7 @@ def write_measurements(
             the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
             ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
             several tips; for standard deviations std_x, ... for a position column x, ..., and std_rx, std_ry, std_rz
-            for the rotation; payload for masses. ``std`` has three names per marker.
+            for the rotation; payload for masses, time and temperature. ``std`` has three names per marker.
         joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
         position: x, y, z columns of every marker or frame; default x, y, z for one, else ``NAME_x``, ... with the names
             of the frames' tips, ``data.marker_names`` or marker1, marker2, ...
@@ -312,6 +312,7 @@ class _Sheet:
             table = _with_names(device, table, triples)
         if whole.payload is not None and table.payload is None:
             table = replace(table, payload=PAYLOAD)
+        table = replace(table, **{name: getattr(table, name) or name for name in whole.covariate_names})
         names = set(whole.device_names) - {""}
         if session is not None and not names:
             raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
@@ -333,6 +334,7 @@ class _Sheet:
             found |= _reading_cells(part, self.readings[id(part)], numeric)
         if part.payload is not None and numeric.payload:
             found[numeric.payload[0]] = part.payload.tolist()
+        found |= _named(numeric.covariates, part.covariates) if numeric.covariates else {}
         session = self.columns.session or next((one.device for one in self.columns.readings), None)
         return found if session is None or not any(part.device_names) else found | {session: part.device_names}
 
@@ -410,7 +412,9 @@ def _check_held(device: Any, whole: Observations, table: TableFormat, position: 
     poses, std, turns, board = (getattr(device, name, None) for name in ("poses", "std", "rotation_std", "board"))
     held = {"rotation": poses, "convention": poses, "rotation_angle": poses}
     deviations, payload = {"std": std, "rotation_std": turns}, {"payload": whole.payload}
-    for group, what in ((held, "poses"), (deviations, "standard deviations"), (payload, "payloads")):
+    drifting = {name: name in whole.covariate_names or None for name in table.covariates}
+    groups = (held, "poses"), (deviations, "standard deviations"), (payload, "payloads"), (drifting, "such a column")
+    for group, what in groups:
         empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
         if empty:
             names = " and ".join(f"`{name}`" for name in empty)

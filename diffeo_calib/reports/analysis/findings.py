@@ -90,6 +90,11 @@ class Findings:
     rms_of = "of these rows"
 
     @property
+    def new(self) -> bool:
+        """Whether the model has not seen the rows shown."""
+        return not self.predictions.left_out
+
+    @property
     def rms(self) -> float:
         """RMS error of the model on the rows shown, m."""
         *_, own = self.errors.values()

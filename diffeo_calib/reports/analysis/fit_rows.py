@@ -125,27 +125,16 @@ class FitRows:
 
         Where markers were hidden the errors are NaN, and the covariance is that of noise alone.
         """
-        errors, covariance = self._left_out
-        seen, noise = self.map.noise.visible, self.map.new_noise
+        whole, noise = self._predictor, self.map.noise
+        every = torch.arange(len(self), device=self.target.device)
+        parts = [(every, whole)] if isinstance(whole, ExplicitParameterRegression) else self.blocks
+        errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
+        for rows, regression in parts:
+            errors[rows], own = regression.left_out(self.target[rows])
+            covariance[rows] = own - noise.covariance[rows]
+        seen = noise.visible
         both = seen[:, :, None] & seen[:, None, :]
-        return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + noise
-
-    @property
-    def _left_out(self) -> tuple[Tensor, Tensor]:
-        """The errors, and their covariance without noise."""
-        whole = self._predictor
-        if isinstance(whole, ExplicitParameterRegression):
-            own = torch.linalg.inv(whole.inverse_blocks())
-            found = (own @ whole.mu(self.target)[:, :, None])[:, :, 0]
-            return found, own - self.map.noise.covariance
-        errors = torch.empty_like(self.target)
-        covariance = torch.empty_like(self.map.noise.covariance)
-        for rows, regression in self.blocks:
-            target = self.target[rows]
-            own = torch.linalg.inv(regression.inverse_blocks(len(rows)))
-            errors[rows] = (own @ regression.mu(target)[:, :, None])[:, :, 0]
-            covariance[rows] = own - self.map.noise.covariance[rows]
-        return errors, covariance
+        return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
 
     def learning_curve(self) -> list[tuple[int, float]]:
         """Number of rows -> RMS distance of other rows from their prediction with the scales of the whole fit, m.

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.analysis.kinds import KindFindings
-from diffeo_calib.reports.html.document import Picture, Section, Table, millimetres, panel
-from diffeo_calib.reports.html.sections import PER_LETTER, UNDER_LEGEND
-from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
-from diffeo_calib.reports.plots.joints import PART_WIDTH, draw_expected, draw_parts, short
-from diffeo_calib.reports.plots.style import Frame
-from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.reports.html.document import Section, Table, millimetres
+from diffeo_calib.reports.html.sections import devices, expected_pictures, parts_picture, stage_pictures, stage_table
 
 NO_POSITIONS = (
     "Coverage, learning curve, repeatability and the workspace in space are not shown: they compare measured positions "
@@ -71,57 +67,26 @@ def sections(found: KindFindings) -> Iterator[Section]:
     yield _how_good(found)
     yield _expected(found)
     yield from devices(found.devices)
-    longest = max(len(short(part.name)) for part in found.parts)
-    frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=0.3 + PER_LETTER * longest)
-    picture = panel("parts", "What each part explains (parts may cancel).", draw_parts, found.parts, frame=frame)
+    picture = parts_picture(found.parts)
     yield Section("why", "Why", "What each part of the model explains.", pictures=[picture], notes=[NO_POSITIONS])
-
-
-def devices(lines: Sequence[str]) -> Iterator[Section]:
-    """Where devices are, if there is anything to say."""
-    if lines:
-        see = (
-            "Where devices and sockets stand, and what was found from the rows shown because the model did not know it."
-        )
-        yield Section("devices", "Devices", see, text=[printable(line) for line in lines])
 
 
 def _how_good(found: KindFindings) -> Section:
     """Errors of every kind by stage."""
-    pictures = list[Picture]()
-    for number, stages in enumerate(found.kinds.values()):
-        label = next(iter(stages.values())).label
-        shares = f"Share of rows whose {label} is at most a value."
-        pictures.append(panel(f"distributions-{number}", shares, draw_distributions, stages, frame=UNDER_LEGEND))
-        against = f"Every row: {label} of the calibrated model against that of the stage before it."
-        pictures.append(panel(f"before-after-{number}", against, draw_before_after, stages, frame=UNDER_LEGEND))
+    every = enumerate(found.kinds.values())
+    pictures = [picture for number, stages in every for picture in stage_pictures(stages, f"-{number}")]
     present = {next(iter(stages.values())).what for stages in found.kinds.values()}
     notes = [text for what, text in FLATTERING.items() if what in present]
     see = f"Errors on {rows_of(found)}, each kind in its own unit; units are never mixed."
     see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
-    return Section("errors", "How good", see, [_table(own) for own in found.kinds.values()], None, pictures, notes)
-
-
-def _table(stages: Mapping[str, Evaluation]) -> Table:
-    """Errors of one kind by stage."""
-    one = next(iter(stages.values()))
-    unit, per_unit = one.shown
-    rows = [
-        [name, *(f"{per_unit * value:.4f}" for value in (own.rms, own.median, own.p95, own.max))]
-        for name, own in stages.items()
-    ]
-    return Table(f"{one.title} by stage", ["stage", f"RMS [{unit}]", "median", "95 %", "max"], rows)
+    return Section("errors", "How good", see, [stage_table(own) for own in found.kinds.values()], None, pictures, notes)
 
 
 def _expected(found: KindFindings) -> Section:
     """What the model expects of its own positions."""
     robot, free = found.model.robot, found.model.map.workspace is not None
     rows = [[name, millimetres(value)] for name, value in found.expected.items()]
-    pictures = [
-        panel(f"expected-{joint}", f"Expected error against {printable(name)}.", draw_expected, robot, joint,
-              found.deviations, key=joint == 0)
-        for joint, name in enumerate(robot.joint_names)
-    ]  # fmt: skip
+    pictures = expected_pictures(robot, found.deviations, "Expected error against {}.")
     see = "RMS errors of positions that the model itself expects over the joint ranges of its rows"
     see += ", after a rigid fit, because no device says where the robot stands" * free
     see += f": {printable(found.deviations.error.sentence)}."

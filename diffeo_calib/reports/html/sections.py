@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 
 import torch
 
-from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.common.errors import PACKAGE, printable
+from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
-from diffeo_calib.kinematics.evaluation import at_payloads
+from diffeo_calib.kinematics.evaluation import at_payloads, placement_sentences
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
+from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import (
     Picture,
@@ -43,6 +45,8 @@ from diffeo_calib.reports.plots.joints import (
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.payload import payload_sentence
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.errors import Evaluation
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
@@ -56,31 +60,70 @@ DIGITS = 5
 """Decimals of a length in m that a scene needs: 10 um at 1 m."""
 
 
+def stage_pictures(
+    stages: Mapping[str, Evaluation], suffix: str = "", repeatability: float | None = None
+) -> Iterator[Picture]:
+    """Errors of one kind of rows by stage; ``suffix`` tells the pictures of several kinds apart."""
+    some = next(iter(stages.values()))
+    label = f"Share of rows whose {some.label} is at most a value."
+    how = {"repeatability": repeatability, "frame": UNDER_LEGEND}
+    yield panel(f"distributions{suffix}", label, draw_distributions, stages, **how)
+    label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
+    yield panel(f"before-after{suffix}", label, draw_before_after, stages, frame=UNDER_LEGEND)
+    if some.angles is not None:
+        label = "Share of rows whose orientation error is at most a value."
+        yield panel(f"angles{suffix}", label, draw_distributions, stages, angles=True, frame=UNDER_LEGEND)
+
+
+def stage_table(stages: Mapping[str, Evaluation]) -> Table:
+    """Errors of one kind of rows by stage, and orientation errors in degrees if there are any."""
+    some = next(iter(stages.values()))
+    unit, per_unit = some.shown
+    header = ["stage", f"RMS [{unit}]", "median", "95 %", "max"]
+    header += ["RMS [deg]", "median", "95 %", "max"] * (some.angles is not None)
+    rows = []
+    for name, own in stages.items():
+        cells = [f"{per_unit * value:.3f}" for value in (own.rms, own.median, own.p95, own.max)]
+        angles = (own.angle_rms, own.angle_median, own.angle_p95, own.angle_max)
+        rows.append([name, *cells, *(f"{angle:.4f}" for angle in angles if angle is not None)])
+    return Table(f"{some.title} by stage", header, rows)
+
+
+def expected_pictures(robot: Tree, expected: Deviations, label: str) -> list[Picture]:
+    """The error that the model itself expects against every joint."""
+    return [
+        panel(f"expected-{k}", label.format(printable(name)), draw_expected, robot, k, expected, key=k == 0)
+        for k, name in enumerate(robot.joint_names)
+    ]
+
+
+def parts_picture(parts: Sequence[Part]) -> Picture:
+    """What each part of a model explains."""
+    left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in parts)
+    frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
+    return panel("parts", "What each part of the model explains (parts may cancel).", draw_parts, parts, frame=frame)
+
+
+def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
+    """What the page shows before its record."""
+    for number, section in enumerate(every := (how_good, where, why, trust, repeatability)):
+        progress("drawing", number, len(every))
+        yield section(found)
+    yield from devices(placement_sentences(found.model))
+
+
+def devices(lines: Sequence[str]) -> Iterator[Section]:
+    """Where devices are, if there is anything to say."""
+    if lines:
+        see = (
+            "Where devices and sockets stand, and what was found from the rows shown because the model did not know it."
+        )
+        yield Section("devices", "Devices", see, text=[printable(line) for line in lines])
+
+
 def how_good(found: Findings) -> Section:
     """Errors by stage."""
-    some = next(iter(found.errors.values()))
-    pictures = [
-        panel(
-            "distributions",
-            "Share of poses whose position error is at most a value.",
-            draw_distributions,
-            found.errors,
-            repeatability=None if found.repeats is None else found.repeats.deviation,
-            frame=UNDER_LEGEND,
-        )
-    ]
-    pictures.append(
-        panel(
-            "before-after",
-            "Every pose: error of the calibrated model against that of the stage before it.",
-            draw_before_after,
-            found.errors,
-            frame=UNDER_LEGEND,
-        )
-    )
-    if some.angles is not None:
-        label = "Share of poses whose orientation error is at most a value."
-        pictures.append(panel("angles", label, draw_distributions, found.errors, angles=True, frame=UNDER_LEGEND))
+    pictures = list(stage_pictures(found.errors, "", None if found.repeats is None else found.repeats.deviation))
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
@@ -91,38 +134,14 @@ def how_good(found: Findings) -> Section:
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses (--data) are the stronger proof."
         )
-    return Section("errors", "How good", see, [_by_stage(found)], None, pictures, notes)
-
-
-def _by_stage(found: Findings) -> Table:
-    """Position errors of each stage in mm, and orientation errors in degrees if there are any."""
-    some = next(iter(found.errors.values()))
-    header = ["stage", "RMS [mm]", "median", "95 %", "max"]
-    header += ["RMS [deg]", "median", "95 %", "max"] * (some.angles is not None)
-    rows = []
-    for name, errors in found.errors.items():
-        cells = [millimetres(errors.rms), millimetres(errors.median), millimetres(errors.p95), millimetres(errors.max)]
-        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
-        rows.append([name, *cells, *(f"{angle:.4f}" for angle in angles if angle is not None)])
-    return Table("Position errors by stage", header, rows)
+    return Section("errors", "How good", see, [stage_table(found.errors)], None, pictures, notes)
 
 
 def where(found: Findings) -> Section:
     """The workspace in space, and expected errors against every joint."""
     robot, expected = found.model.robot, found.expected
-    pictures = [
-        panel(
-            f"expected-{joint}",
-            f"Error that the model itself expects against {name}: dashed anywhere in the measured ranges, solid where "
-            "it was measured.",
-            draw_expected,
-            robot,
-            joint,
-            expected,
-            key=joint == 0,
-        )
-        for joint, name in enumerate(robot.joint_names)
-    ]
+    label = "Error that the model itself expects against {}: dashed anywhere in the measured ranges, solid where "
+    pictures = expected_pictures(robot, expected, f"{label}it was measured.")
     q = expected.next.q[expected.next.rank.argsort()]
     table = Table(
         f"Where to measure next: {len(q)} poses that would lower the expected error most",
@@ -158,16 +177,7 @@ def _scene(found: Findings) -> Scene:
 def why(found: Findings) -> Section:
     """Transmission errors, parts, geometry corrections."""
     robot = found.model.robot
-    longest = max(len(short(part.name)) for part in found.parts)
-    pictures = [
-        panel(
-            "parts",
-            "What each part of the model explains (parts may cancel).",
-            draw_parts,
-            found.parts,
-            frame=Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=0.3 + PER_LETTER * longest),
-        )
-    ]
+    pictures = [parts_picture(found.parts)]
     for joint, name in enumerate(robot.joint_names):
         pictures.append(
             panel(

@@ -47,6 +47,24 @@ def verdict(found: Findings) -> str:
     return f"{found_on}. {most} {what} about {1e3 * found.limit:.3f} mm."
 
 
+def figures(found: Findings) -> Iterator[tuple[str, str]]:
+    """Name and value of the numbers at the top."""
+    for name, errors in found.errors.items():
+        yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
+    *_, own = found.errors.values()
+    if own.angle_rms is not None:
+        yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
+    if len(found.predictions) >= ENOUGH_FOR_P95:
+        yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
+    yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
+    error = found.expected.error
+    if error.whole > FAR_RATIO * error.measured:
+        apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
+        yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
+    if found.repeats is not None and found.repeats.telling:
+        yield "repeatability", f"{1e3 * found.limit:.3f} mm"
+
+
 def advice(found: Findings) -> Iterator[str]:
     """What to do next, the most important first."""
     yield from found.moved

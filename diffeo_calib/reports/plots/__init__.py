@@ -5,8 +5,9 @@ Every function returns a :class:`matplotlib.figure.Figure` and touches neither p
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from diffeo_calib.common.lazy import lazy_names
 
 if TYPE_CHECKING:
     from diffeo_calib.reports.plots.errors import stages, workspace
@@ -25,25 +26,13 @@ __all__ = [
     "workspace",
 ]
 
-_MODULE_OF = {
-    "comparison": "joints",
-    "expected_error": "joints",
-    "explained": "joints",
-    "learning_curve": "trust",
-    "residuals": "trust",
-    "stages": "errors",
-    "transmissions": "joints",
-    "uncertainty": "trust",
-    "workspace": "errors",
-}
-
 if not TYPE_CHECKING:
-
-    def __getattr__(name: str) -> object:
-        """Load a plot when it is first used."""
-        if name not in _MODULE_OF:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    modules = {
+        "errors": "stages workspace",
+        "joints": "comparison expected_error explained transmissions",
+        "trust": "learning_curve residuals uncertainty",
+    }
+    __getattr__, _ = lazy_names(__name__, modules)
 
     def __dir__() -> list[str]:
         """The plots, so that consoles complete their names."""

@@ -42,7 +42,7 @@ LONGEST_NAME = 36
 def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
     """Transmission error of every joint against its value, with its 95 % band and the measured values below."""
     rows = FitRows(model)
-    figure, grid = panels(model.robot.n, columns=min(3, model.robot.n), title=title)
+    figure, grid = panels(model.robot.n, columns=3, title=title)
     for joint, axes in enumerate(grid):
         draw_transmission(axes, model, rows, joint)
     return figure
@@ -98,7 +98,7 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
 def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 0) -> Figure:
     """Error that the model itself expects, against every joint over the ranges of its fit."""
     found = expected_errors(model, seed)
-    figure, grid = panels(model.robot.n, columns=min(3, model.robot.n), title=title)
+    figure, grid = panels(model.robot.n, columns=3, title=title)
     for joint, axes in enumerate(grid):
         draw_expected(axes, model.robot, joint, found)
     return figure
@@ -131,13 +131,15 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key
         legend(axes, loc="upper left", ncols=2)
 
 
-def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float], list[Tensor]]:
+def in_bins(
+    values: Tensor, lengths: Tensor, bins: int = 10, fewest: int = FEWEST_IN_BIN
+) -> tuple[list[float], list[Tensor]]:
     """Middles of intervals of values, and the lengths there: not a number where there are fewer than three."""
     edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype, device=values.device)
     number = torch.bucketize(values, edges[1:-1])
     groups = [lengths[number == k] for k in range(bins)]
     middles = [float(edges[k : k + 2].mean()) for k in range(bins)]
-    return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
+    return middles, [group if len(group) >= fewest else group.new_tensor([nan]) for group in groups]
 
 
 def short(name: str) -> str:
@@ -165,20 +167,14 @@ def comparison(found: ModelComparison, robot: Tree, title: str = "") -> Figure:
     Args:
         found: the comparison. robot: names and kinds of the joints. title: one line that names the models.
     """
-    figure, grid = panels(robot.n, columns=min(3, robot.n), title=title)
-    length = 1e3 * found.difference.square().sum(-1).mean(1).sqrt()
-    expected = 1e3 * found.deviation.square().mean(1).sqrt()
-    highest = 0.0
+    figure, grid = panels(robot.n, columns=3, title=title)
+    lengths = found.difference.square().sum(-1).mean(1).sqrt(), found.deviation.square().mean(1).sqrt()
+    looks, highest = (("-o", BLUE, "difference"), ("--", GREY, "explained by uncertainty")), 0.0
     for joint, axes in enumerate(grid):
         values = joint_values(robot, joint, found.q[:, joint])
-        edges = values.new_tensor(np.linspace(float(values.min()), float(values.max()), COMPARISON_BINS + 1))
-        number = torch.bucketize(values, edges[1:-1])
-        middles = 0.5 * (edges[1:] + edges[:-1])
-        for what, style, colour, label in (
-            (length, "-o", BLUE, "difference"),
-            (expected, "--", GREY, "explained by uncertainty"),
-        ):
-            means = [float(what[number == k].square().mean().sqrt()) for k in range(COMPARISON_BINS)]
+        for what, (style, colour, label) in zip(lengths, looks, strict=True):
+            middles, groups = in_bins(values, 1e3 * what, COMPARISON_BINS, fewest=1)
+            means = [float(group.square().mean().sqrt()) for group in groups]
             axes.plot(middles, means, style, color=colour, markersize=3, label=label)
             highest = max(highest, *[mean for mean in means if isfinite(mean)])
         finish(axes, x=joint_label(robot, joint), y="RMS distance [mm]" if joint % 3 == 0 else "")

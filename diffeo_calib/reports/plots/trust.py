@@ -56,7 +56,7 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
 def residuals(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
     """Errors against row and every joint; arguments as :func:`uncertainty`."""
     predictions = _predictions(model, data)
-    figure, grid = panels(1 + model.robot.n, columns=min(3, 1 + model.robot.n), title=title)
+    figure, grid = panels(1 + model.robot.n, columns=3, title=title)
     draw_residuals(grid[0], predictions.data.line_numbers.double(), predictions, "row")
     for joint, axes in enumerate(grid[1:]):
         values = joint_values(model.robot, joint, predictions.data.q[:, joint])

@@ -204,7 +204,9 @@ def test_evaluation_of_each_kind(
     assert [one.error for one in both["socket"].distances] == pytest.approx(errors, abs=1e-12)
     assert len(both["socket"].distances) == 4
     assert result.model.summary is not None
-    assert result.left_out_rms == result.leave_one_out.rows(torch.arange(TRACKED)).rms
+    left_out = result.leave_one_out.errors
+    assert result.left_out_rms == pytest.approx(rms(left_out[:TRACKED, :3]), rel=1e-9)
+    assert result.left_out["socket"].rms == pytest.approx(rms(left_out[TRACKED:, 3:]), rel=1e-9)
     assert both.rms == pytest.approx(result.model.summary.diffeomorphic_rms, rel=1e-12)
 
 

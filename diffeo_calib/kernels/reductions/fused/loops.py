@@ -81,7 +81,7 @@ class Program:
         return text, [result.factor for result in plain.results]
 
 
-class _Pairs:
+class SymbolicPairs:
     """Pairwise scalars of a row and a vector of columns, as symbols."""
 
     def __init__(self, code: Code) -> None:
@@ -148,7 +148,7 @@ class _Block:
         columns = self._points(self._column)
         codes = [Code(self.vector, numbers) for _ in rows]
         weights = [
-            program.formula.weights(_Pairs(code), program.profile, i, columns)
+            program.formula.weights(SymbolicPairs(code), program.profile, i, columns)
             for code, i in zip(codes, points, strict=True)
         ]
         self.loop.lines += [line for lines in zip(*[code.lines for code in codes], strict=True) for line in lines]
@@ -237,7 +237,7 @@ class _Block:
                 return [((w, b), (w, c)) for b, c in zip(ours, theirs, strict=True)]
             ours = [code.call("fmul", w, b) for b in ours]
             theirs = [code.call("fmul", w, c) for c in theirs] if self.mirrored else ours
-        apart = _Pairs(code).apart(getattr(i, term.apart or ""), getattr(j, term.apart or ""))
+        apart = SymbolicPairs(code).apart(getattr(i, term.apart or ""), getattr(j, term.apart or ""))
         return [((a, d), (b, d)) for a, b in zip(ours, theirs, strict=True) for d in apart]
 
     def _store_shares(self, result: _Result) -> None:

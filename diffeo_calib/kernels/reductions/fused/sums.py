@@ -13,26 +13,34 @@ import hashlib
 import os
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache, reduce
-from threading import Lock
+from itertools import count
+from threading import RLock
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
-from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program
-from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program, SymbolicPairs
+from diffeo_calib.kernels.reductions.fused.symbols import Code, Vector
 from diffeo_calib.kernels.reductions.keops import cache_folder
 from diffeo_calib.kernels.reductions.tiled import dealt
 
 DIGEST = hashlib.sha256().digest_size
+LOCK = RLock()
+"""Held while LLVM works, which does one thing at a time. Forking waits for it: in the new process nobody would release
+the lock."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 
 
 class Machine:
@@ -60,7 +68,7 @@ class Machine:
         self.mark = f"{name} {features} {llvmlite.__version__}"
         # ELF on Windows too, whose own format the loader of objects handles badly
         triple = llvm.get_process_triple() + ("-elf" if sys.platform == "win32" else "")
-        self.llvm, self.lock, self.loaded = llvm, Lock(), set[str]()
+        self.llvm, self.loaded = llvm, set[str]()
         options = {"cpu": name, "features": features, "opt": 3, "reloc": "pic", "codemodel": "small"}
         self.target = llvm.Target.from_triple(triple).create_target_machine(**options)
         # one block of memory for each module: in a process with much memory its sections may else lie too far apart for
@@ -76,7 +84,7 @@ class Machine:
         mark = hashlib.sha256(f"{self.mark}\n{text}".encode()).hexdigest()[:24]
         for name in names:
             text = text.replace(f"@{name}(", f"@{name}_{mark}(")
-        with self.lock:
+        with LOCK:
             if mark not in self.loaded:
                 self._load(mark, text)
                 self.loaded.add(mark)
@@ -88,7 +96,8 @@ class Machine:
         code = _kept(mark)
         if code is None:
             code = self._emit(text)
-            _keep(mark, code)
+            with suppress(OSError, RuntimeError, InputError):  # a folder that cannot be written does not matter
+                write_whole(cache_folder("fused") / mark, hashlib.sha256(code).digest() + code)
         self.engine.add_object_file(self.llvm.ObjectFileRef.from_data(code))
         self.engine.finalize_object()
 
@@ -98,9 +107,14 @@ class Machine:
         return self.target.emit_object(module)
 
 
-@cache
 def machine() -> Machine:
-    """This processor."""
+    """This processor: one for the whole program, since the functions that it compiles end with it."""
+    with LOCK:
+        return _machine()
+
+
+@cache
+def _machine() -> Machine:
     return Machine()
 
 
@@ -112,15 +126,6 @@ def _kept(mark: str) -> bytes | None:
         return None
     digest, code = content[:DIGEST], content[DIGEST:]
     return code if hashlib.sha256(code).digest() == digest else None
-
-
-def _keep(mark: str, code: bytes) -> None:
-    """Write the compiled module in one step, if the folder can be written."""
-    with suppress(OSError, RuntimeError):
-        folder = cache_folder("fused")
-        partial = folder / f"{mark}.{os.getpid()}"
-        partial.write_bytes(hashlib.sha256(code).digest() + code)
-        partial.replace(folder / mark)
 
 
 Chosen = Callable[[Sequence[Any]], list[Any]]
@@ -138,8 +143,13 @@ MOST_GROUP = 16
 """Largest number of points that a program processes together."""
 MOST_OUTPUTS = 96
 """Sums per row beyond which products of matrices take less time."""
-MOST_VARIANTS = 32
-"""Profiles of one class that are compiled. With more, a parameter is being optimised, and compiling takes too long."""
+MOST_INPUTS = 64
+"""Numbers of a point beyond which compiling takes seconds, and products of matrices take less time."""
+MOST_VARIANTS = 64
+"""Sums with profiles of one class of the user's that are compiled. With more, a parameter is being optimised, and
+compiling takes too long."""
+SHIPPED = {type(profile) for profile in PROFILES.values()}
+"""Classes of profiles that always compute the same."""
 
 
 class _Lines(NamedTuple):
@@ -193,11 +203,12 @@ class Compiled(NamedTuple):
         totals, tiles = self._zeros(left), mine(range(-(-left.count // side)))
         columns_ = (right.values.data_ptr(), right.count, right.length)
 
-        def part(tile: int) -> None:
-            first, last = tile * side, min((tile + 1) * side, left.count)
-            self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
+        def part(tiles: list[int]) -> None:
+            for first in (tile * side for tile in tiles):
+                last = min(first + side, left.count)
+                self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
 
-        for _ in in_parallel(part, tiles) if large else map(part, tiles):
+        for _ in in_parallel(part, dealt(tiles, PARTS if large else 1)):
             pass
         return totals
 
@@ -244,7 +255,7 @@ class Fused:
     def __init__(self) -> None:
         self.failed = False
         self._programs: dict[Hashable, Compiled | None] = {}
-        self._variants: dict[type, set[Hashable]] = {}
+        self._own = Counter[type]()
 
     def available(self) -> bool:
         """Whether llvmlite is installed and compiles for this machine."""
@@ -258,18 +269,17 @@ class Fused:
 
     def program(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> Compiled | None:
         """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
-        dtype, state = columns.features.dtype, _state(profile)
+        dtype = columns.features.dtype
         alike = all(t.dtype == dtype and t.device.type == "cpu" for t in (*(rows or ()), *columns) if t is not None)
-        if dtype not in REALS or not alike or state is None or not self.available():
-            return None
-        variants = self._variants.setdefault(type(profile), set())
-        variants.add(state)
-        if len(variants) > MOST_VARIANTS:
+        if dtype not in REALS or not alike or not self.available():
             return None
         inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
-        key = (formula, state, dtype, inputs)
-        if key not in self._programs:
-            self._programs[key] = self._compiled(formula, profile, inputs, dtype)
+        try:
+            key = (formula, profile if type(profile) in SHIPPED else _instructions(formula, profile), dtype, inputs)
+            if key not in self._programs:
+                self._programs[key] = self._compiled(formula, profile, inputs, dtype)
+        except Exception:  # a profile of the user may raise anything where it gets symbols, and works with tensors
+            return None
         return self._programs[key]
 
     def _compiled(
@@ -277,12 +287,13 @@ class Fused:
     ) -> Compiled | None:
         real, size = REALS[dtype]
         program = Program(formula, profile, inputs, Vector(real, machine().vector_bytes // size))
-        if program.count > MOST_OUTPUTS:
+        if program.count > MOST_OUTPUTS or sum(program.sizes.values()) > MOST_INPUTS:
             return None
-        try:
-            text, factors = program.code()
-        except (TypeError, AttributeError):
-            return None
+        if type(profile) not in SHIPPED:
+            if self._own[type(profile)] == MOST_VARIANTS:
+                return None
+            self._own[type(profile)] += 1
+        text, factors = program.code()
         try:
             return Compiled(program, factors, *machine().functions(text, LOOPS))
         except Exception as error:  # LLVM may raise anything
@@ -319,16 +330,11 @@ def _numbers(tiles: tuple[int, ...]) -> Tensor:
     return torch.tensor(tiles, dtype=torch.int64, device=HOST)
 
 
-def _state(profile: Profile) -> Hashable:
-    """The class of a profile and its parameters; None if they cannot be compared."""
-    found: list[Hashable] = [type(profile)]
-    try:
-        for name, value in vars(profile).items():
-            found += [name, (tuple(value.flatten().tolist()), value.shape) if isinstance(value, Tensor) else value]
-        hash(state := tuple(found))
-    except TypeError:
-        return None
-    return state
+def _instructions(formula: Formula, profile: Profile) -> Hashable:
+    """What a formula does with a profile, whose numbers may come from anywhere and change at any time."""
+    code, sides = Code(Vector("double", 1), count()), (Points(*([f"%{side}{k}"] for k in range(4))) for side in "ij")
+    weights = formula.weights(SymbolicPairs(code), profile, *sides)
+    return (*code.lines, *((w.value, w.scale) for w in weights))
 
 
 @cache

@@ -9,8 +9,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import log
+from math import inf, log
 from typing import Any
+
+from diffeo_calib.kernels.reductions.formulas import Unknown, constant
 
 MOST_FACTORS = 8
 """Of a power in a profile."""
@@ -39,8 +41,9 @@ EXP2 = {
     ),
 }
 """Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16 and 3e-9."""
-EXPONENTS = {"double": (-1021.0, 1023.0, 52, 64), "float": (-125.0, 127.0, 23, 32)}
-"""Smallest and largest power of 2, bits of the fraction, bits of a number."""
+EXPONENTS = {"double": (-1022, 1023, 52, 64), "float": (-126, 127, 23, 32)}
+"""Smallest and largest power of 2, bits of the fraction, bits of a number. The largest is also what the bits of an
+exponent have added."""
 
 
 @dataclass(frozen=True)
@@ -102,24 +105,22 @@ class Code:
         v = self.vector
         return self.value(f"call {v} @llvm.fmuladd.{v.suffix}({v} {a}, {v} {b}, {v} {c})")
 
-    def bounded(self, x: str, limit: str, side: str) -> str:
-        """The limit where x is below ("olt") or above ("ogt") it; NaN stays NaN."""
+    def replaced(self, x: str, side: str, limit: float, instead: float, y: str) -> str:
+        """A number where x is below ("olt") or above ("ogt") a limit, else y, also where x is NaN."""
         v = self.vector
-        beyond = self.value(f"fcmp {side} {v} {x}, {limit}")
-        return self.value(f"select <{self.vector.lanes} x i1> {beyond}, {v} {limit}, {v} {x}")
+        beyond = self.value(f"fcmp {side} {v} {x}, {self.constant(limit)}")
+        return self.value(f"select <{v.lanes} x i1> {beyond}, {v} {self.constant(instead)}, {v} {y}")
 
     def exp2(self, x: str, factor: float, above: bool, below: bool) -> str:
-        """2^(factor x).
+        """2^(factor x); beyond the range of powers 0 or infinity.
 
         Args:
             above, below: whether x may lead above, below the range of powers.
         """
         low, high, fraction, bits = EXPONENTS[self.vector.real]
-        for cut, limit in ((above, high / factor), (below, low / factor)):
-            if cut:
-                x = self.bounded(x, self.constant(limit), "ogt" if limit > 0 else "olt")
         v, c = self.vector, self.constant(factor)
-        shift = self.constant(1.5 * 2.0**fraction)  # adding it rounds to integers, in the last bits of the sum
+        # adding it rounds to integers, in the last bits of the sum: those of an exponent
+        shift = self.constant(1.5 * 2.0**fraction + high)
         moved = self.fused(x, c, shift)
         f = self.fused(x, c, self.value(f"fneg {v} {self.call('fsub', moved, shift)}"))
         p, *rest = (self.constant(c) for c in reversed(EXP2[self.vector.real]))
@@ -128,12 +129,15 @@ class Code:
         whole = f"<{self.vector.lanes} x i{bits}>"
         power = self.value(f"bitcast {v} {moved} to {whole}")
         places = f"<{', '.join([f'i{bits} {fraction}'] * self.vector.lanes)}>"
-        power = self.value(f"shl {whole} {power}, {places}")
-        power = self.value(f"add {whole} {power}, {self.value(f'bitcast {v} {p} to {whole}')}")
-        return self.value(f"bitcast {whole} {power} to {v}")
+        power = self.value(f"bitcast {whole} {self.value(f'shl {whole} {power}, {places}')} to {v}")
+        found = self.call("fmul", p, power)  # a product, so that NaN stays NaN whatever its bits
+        for cut, limit, instead in ((above, high / factor, inf), (below, low / factor, 0.0)):
+            if cut:
+                found = self.replaced(x, "ogt" if limit > 0 else "olt", limit, instead, found)
+        return found
 
 
-class Symbol:
+class Symbol(Unknown):
     """scale * value, or the number ``scale`` itself where there is no value.
 
     Args:
@@ -147,7 +151,8 @@ class Symbol:
 
     def __mul__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            return Symbol(self.code, self.value if float(other) else None, self.scale * float(other), self.positive)
+            number = constant(other)
+            return Symbol(self.code, self.value if number else None, self.scale * number, self.positive)
         if self.value is None or other.value is None:
             one = self if other.value is None else other
             return one * (other if one is self else self).scale
@@ -157,7 +162,7 @@ class Symbol:
 
     def __add__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            other = Symbol(self.code, None, float(other))
+            other = Symbol(self.code, None, constant(other))
         if self.value is None and other.value is None:
             return Symbol(self.code, None, self.scale + other.scale)
         if self.value is None or self.scale == 0.0:
@@ -184,7 +189,7 @@ class Symbol:
 
     def __truediv__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            return self * (1.0 / float(other))
+            return self * (1.0 / constant(other))
         if other.value is None:
             return self * (1.0 / other.scale)
         above = self.value or self.code.constant(1.0)
@@ -193,7 +198,7 @@ class Symbol:
         return Symbol(self.code, ratio, self.scale / other.scale, positive)
 
     def __rtruediv__(self, other: Any) -> Symbol:
-        return Symbol(self.code, None, float(other)) / self
+        return Symbol(self.code, None, constant(other)) / self
 
     def __pow__(self, power: Any) -> Symbol:
         whole = int(power)
@@ -226,7 +231,7 @@ class Symbol:
         """max(x, 0), elementwise."""
         if self.positive and self.scale >= 0.0:
             return self
-        return Symbol(self.code, self.code.bounded(self.plain, self.code.constant(0.0), "olt"), 1.0, True)
+        return Symbol(self.code, self.code.replaced(self.plain, "olt", 0.0, 0.0, self.plain), 1.0, True)
 
     def square(self) -> Symbol:
         """Elementwise."""

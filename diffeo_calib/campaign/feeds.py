@@ -1,0 +1,192 @@
+"""Rows as JSON lines: how a program of the user's own feeds a campaign, over standard input or a socket.
+
+Every line that is sent is one JSON object in UTF-8 that ends with a newline. Its keys are the columns of the table:
+the joints, and whatever was measured there, in the units of the table; null where a marker was hidden. The first
+object names all columns of a table that is not there yet. A line without its newline is never taken in. ::
+
+    {"id": 7, "joint_1": -28.1, ..., "joint_6": 78.9, "x": -1982.31, "y": 1750.62, "z": 349.83}
+
+Each line is answered by one, in order. A row that is answered is on the disk, with its verdict. ::
+
+    {"id": 7, "line": 8, "row": 6, "fits": true, "accepted": true, "error_mm": 0.03, "usual_mm": 0.04, "cause": "",
+     "change": null, "text": "row 6 fits: ...", "revised": [], "expected_error_mm": 0.21, "more_rows": 14,
+     "target_reached": false, "next": [{"joint_1": 12.9, ..., "joint_6": -40.2}], "rows": 7, "accepted_rows": 7}
+    {"id": 7, "error": "the line was not taken in, and why"}
+
+`fits` is null as long as there is no model; `more_rows` and `target_reached` belong to a target. `change`: what changed
+before the row (`row`, `cause`, `others`, `size`, `unit`, `fix`); `revised`: earlier rows taken in or left out by this.
+
+`id` is optional: a number or a word that is a column of the table and tells rows apart. After a cut connection, a
+program sends the rows again that were not answered: a row whose id the table has is answered and not taken in again.
+
+Other objects: `{}` asks for the last six of these alone; `{"do": "reject", "row": 5}` leaves a row out, "accept" takes
+it in. A socket answers `{}` by itself when a connection begins, and says `"ended": true` when the campaign ends. Where
+it needs a token, `{"token": "..."}` is the first line. A line that is no JSON object ends its connection: browsers,
+too, can send text to local ports.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from queue import Queue, SimpleQueue
+from socketserver import StreamRequestHandler, ThreadingTCPServer
+from threading import Event, Lock, Thread
+from typing import Any, NamedTuple
+
+from diffeo_calib.common.errors import DiffeoCalibError, InputError
+
+MOST_BYTES = 1 << 20
+"""Of a line."""
+DECISIONS = ("accept", "reject")
+"""What a user may do with a row: methods of a campaign."""
+LOCAL = ("127.0.0.1", "localhost")
+CLOSING_SECONDS = 2.0
+"""For the last answers of a campaign."""
+
+Entry = dict[str, Any]
+
+
+class Sent(NamedTuple):
+    """An object that was sent, or why a line is none; and what takes the answer."""
+
+    entry: Entry | DiffeoCalibError
+    answer: Callable[[Entry], object]
+
+
+def parsed(text: bytes) -> Entry:
+    """The object of a line; InputError unless it is whole, and its values are numbers, words or null."""
+    try:
+        entry = json.loads(text, parse_constant=_refused) if text.endswith(b"\n") else None
+    except (ValueError, RecursionError):
+        entry = None
+    if not isinstance(entry, dict) or not all(map(_is_cell, (*entry, *entry.values()))):
+        expected = "a JSON object of numbers, words and null that ends with a newline"
+        raise InputError.of("a line of JSON", expected=expected, got=repr(text[:60].decode(errors="replace")))
+    return entry
+
+
+def _refused(text: str) -> None:
+    raise ValueError(text)
+
+
+def _is_cell(value: object) -> bool:
+    """Whether a value fits into a cell of a table."""
+    return value is None or isinstance(value, int | float) or (isinstance(value, str) and value.isprintable())
+
+
+def read_lines(lines: Iterable[bytes], inbox: Queue[Sent | None], answer: Callable[[Entry], object]) -> None:
+    """Put what lines hold into an inbox, and None at their end; what is no object with the reason."""
+    for text in lines:
+        try:
+            inbox.put(Sent(parsed(text), answer))
+        except InputError as error:
+            inbox.put(Sent(error, answer))
+    inbox.put(None)
+
+
+@contextmanager
+def listening(address: str, token: str, inbox: Queue[Sent | None]) -> Iterator[Listener]:
+    """Put what comes over a socket at ``HOST:PORT`` into an inbox; PORT 0 is any free one.
+
+    Args:
+        token: that connections must begin with; empty for none, at addresses of this machine alone.
+
+    Raises:
+        InputError: another machine's address without a token, no such address, or one that is taken.
+    """
+    host, _, port = address.rpartition(":")
+    host = host or LOCAL[0]
+    if host not in LOCAL and not token:
+        fix = f"add a token, or listen at {LOCAL[0]}:{port}"
+        raise InputError.of(f"other machines could send rows to {address}", expected="a token", got="none", fix=fix)
+    try:
+        server = Listener((host, int(port)), token, inbox)
+    except (OSError, ValueError, OverflowError) as error:
+        expected = "a free port, or HOST:PORT"
+        raise InputError.of(f"the socket at {address}", expected=expected, got=str(error)) from error
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.end()
+        server.server_close()
+        thread.join()
+
+
+class Listener(ThreadingTCPServer):
+    """A socket that rows come from.
+
+    Attributes:
+        address: HOST:PORT. last: what every connection is told at the end.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, place: tuple[str, int], token: str, inbox: Queue[Sent | None]) -> None:
+        super().__init__(place, _Connection)
+        self.address = f"{self.server_address[0]}:{self.server_address[1]}"
+        self.token, self.inbox, self.last = token, inbox, {"ended": True}
+        self._open, self._lock, self._none = set[socket.socket](), Lock(), Event()
+        self._none.set()
+
+    def note(self, connection: socket.socket, *, opened: bool) -> None:
+        """Remember the connections that are open."""
+        with self._lock:
+            (self._open.add if opened else self._open.discard)(connection)
+            (self._none.clear if self._open else self._none.set)()
+
+    def end(self) -> None:
+        """Read no more, and wait until the last answers are written."""
+        with self._lock:
+            for connection in self._open:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RD)
+        self._none.wait(CLOSING_SECONDS)
+
+    def handle_error(self, *_: object) -> None:
+        """A cut connection is no event: its rows are sent again."""
+
+
+class _Connection(StreamRequestHandler):
+    """Sends what comes over one connection, line by line, and answers it."""
+
+    server: Listener
+
+    def handle(self) -> None:
+        self.server.note(self.connection, opened=True)
+        try:
+            if not self.server.token or self._is_known():
+                self._ask({})
+                while text := self.rfile.readline(MOST_BYTES):
+                    self._ask(parsed(text))
+                self._write(self.server.last)
+        except InputError as error:
+            self._write({"error": str(error)})
+        finally:
+            self.server.note(self.connection, opened=False)
+
+    def _is_known(self) -> bool:
+        given = str(parsed(self.rfile.readline(MOST_BYTES)).get("token"))
+        if not secrets.compare_digest(given.encode(), self.server.token.encode()):
+            raise InputError.of("the first line", expected='{"token": "..."} with the token of the campaign')
+        return True
+
+    def _ask(self, entry: Entry) -> None:
+        answers: SimpleQueue[Entry] = SimpleQueue()
+        self.server.inbox.put(Sent(entry, answers.put))
+        self._write(answers.get())
+
+    def _write(self, answer: Entry) -> None:
+        self.wfile.write(as_line(answer))
+
+
+def as_line(answer: Entry) -> bytes:
+    """An answer as it is sent."""
+    return (json.dumps(answer, allow_nan=False) + "\n").encode()

@@ -1,0 +1,252 @@
+"""A running campaign: the table that it follows, its journal, and what it answers."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from diffeo_calib.campaign.campaign import Campaign
+from diffeo_calib.campaign.feeds import DECISIONS, Entry, Sent, as_line
+from diffeo_calib.campaign.journal import GrowingTable, Journal, digest
+from diffeo_calib.campaign.planned import Next
+from diffeo_calib.campaign.verdicts import Verdict
+from diffeo_calib.cli.console import say
+from diffeo_calib.cli.tables import MeasuredTable, joint_columns
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.measurements.csv.columns import Columns
+
+KEPT = ("fits", "accepted", "error", "expected", "cause", "decided")
+"""What a journal keeps of a verdict."""
+ID = "id"
+"""Column that tells rows apart."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """How long a campaign goes on, and what it proposes.
+
+    Args:
+        error: expected error to reach, m; None for none. poses: number of the next poses. lines: whether everything is
+            said as JSON lines.
+    """
+
+    error: float | None
+    poses: int
+    lines: bool
+
+
+@dataclass
+class Live:
+    """A campaign, the table that it follows and its journal.
+
+    Args:
+        tips: of the markers. table: the file. owner: the line of each row. lines: all that were judged.
+        waiting: those that were there at the start and were not. said: whether each row was accepted, by the journal.
+        ids: number of the line of each id. unreadable: lines that are no rows, and why.
+        revised: rows that the last line changed.
+    """
+
+    campaign: Campaign
+    source: MeasuredTable
+    tips: Sequence[str]
+    journal: Journal
+    goal: Goal
+    table: GrowingTable = field(init=False)
+    owner: list[int] = field(default_factory=list)
+    lines: list[bytes] = field(default_factory=list)
+    waiting: list[bytes] = field(default_factory=list)
+    said: list[bool] = field(default_factory=list)
+    ids: dict[str, int] = field(default_factory=dict)
+    unreadable: dict[int, str] = field(default_factory=dict)
+    revised: list[int] = field(default_factory=list)
+    _found: tuple[object, Next | None] | None = None
+
+    def __post_init__(self) -> None:
+        self.table = GrowingTable(self.source.csv, self.source.table.sep, self.source.table.decimal)
+
+    def say(self, text: str, entry: Entry) -> None:
+        """Print a text, or an entry as a line of JSON."""
+        if self.goal.lines:
+            sys.stdout.write(as_line(entry).decode())
+            sys.stdout.flush()
+        elif text:
+            say(text)
+
+    def resume(self) -> None:
+        """Go on after the lines that the journal knows."""
+        known = [one for one in self.journal.entries if "line" in one]
+        lines = self.table.new_lines()
+        for number, entry in enumerate(known):
+            if number >= len(lines) or digest(lines[number]) != entry["sha"]:
+                fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
+                raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
+        for line in lines[: len(known)]:
+            self._keep(line)
+        self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
+        verdicts = [one for entry in known for one in entry.get("rows", [])]
+        for entry in self.journal.entries:
+            if "row" in entry:
+                verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
+        readable = [line for line, entry in zip(lines, known, strict=False) if "rows" in entry]
+        self.owner = [number for number, entry in enumerate(known) for _ in entry.get("rows", [])]
+        if verdicts:
+            self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
+            self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
+        self.said = [one.accepted for one in self.campaign.verdicts]
+        self.waiting = lines[len(known) :]
+
+    def new_lines(self) -> list[bytes]:
+        """Lines that have not been judged."""
+        found, self.waiting = [*self.waiting, *self.table.new_lines()], []
+        return found
+
+    def judge(self, lines: Sequence[bytes]) -> None:
+        """Judge lines, and say what became of them; after the last what comes next."""
+        for left, line in zip(reversed(range(len(lines))), lines, strict=True):
+            number = self._add(line)
+            self._say(self.answer(number) | ({} if left or self.reached() else self.state()))
+            if self.reached():
+                return
+
+    def take(self, sent: Sent) -> None:
+        """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
+        entry = {} if isinstance(sent.entry, DiffeoCalibError) else sent.entry
+        told = {ID: entry[ID]} if ID in entry else {}
+        try:
+            if isinstance(sent.entry, DiffeoCalibError):
+                raise sent.entry
+            if "do" in entry:
+                self.decide(entry.get("row"), entry["do"])
+            elif entry:
+                number = self.ids.get(str(entry.get(ID)))
+                told = self.answer(self._append(entry) if number is None else number) | told
+            self.campaign.poll()
+            told |= self.state()
+        except InputError as error:
+            told["error"] = str(error)
+        self._say(told)
+        sent.answer(told)
+
+    def decide(self, row: object, what: object) -> None:
+        """Do what a user decided about a row; InputError for no such row or decision."""
+        if what not in DECISIONS:
+            raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
+        getattr(self.campaign, str(what))(row)
+        self.journal.add(self._revised())
+
+    def _append(self, row: Entry) -> int:
+        """Append a row to the table and judge it; the number of its line.
+
+        Raises:
+            InputError: no row of this table, or it cannot be written.
+        """
+        self.judge(self.new_lines())
+        header, line = self.table.written(row)
+        self._read([line], header)
+        self.table.append(header, line)
+        *others, own = self.new_lines()
+        self.judge(others)
+        return self._add(own)
+
+    def _add(self, line: bytes) -> int:
+        """Judge a line, and bring that to the disk; its number."""
+        number = len(self.lines)
+        entry: Entry = {"line": number + 2, "sha": digest(line)}
+        try:
+            verdicts = self.campaign.add(self._read([line]))
+            entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in verdicts]
+            self.owner += [number] * len(verdicts)
+        except DiffeoCalibError as error:
+            entry["unreadable"] = self.unreadable[number] = str(error)
+        self._keep(line)
+        self.journal.add([entry, *self._revised()])
+        return number
+
+    def _keep(self, line: bytes) -> None:
+        self.lines.append(line)
+        header, cells = self.table.cells(self.table.header), self.table.cells(line)
+        if ID in header and len(cells) == len(header):
+            self.ids[cells[header.index(ID)]] = len(self.lines) - 1
+
+    def _revised(self) -> Iterator[Entry]:
+        """Entries of rows that are accepted now and were not, or the other way round."""
+        now = [one.accepted for one in self.campaign.verdicts]
+        self.revised = [row for row, (one, other) in enumerate(zip(self.said, now, strict=False)) if one != other]
+        self.said = now
+        for row in self.revised:
+            yield {"row": row} | {name: getattr(self.campaign.verdicts[row], name) for name in KEPT}
+
+    def answer(self, number: int) -> Entry:
+        """What became of a line."""
+        known, found = self.campaign.verdicts, dict[str, Any](line=number + 2)
+        if number in self.unreadable:
+            return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
+        rows = [row for row, owner in enumerate(self.owner) if owner == number]
+        found |= known[rows[0]].entry()
+        found["text"] = "\n".join(str(known[row]) for row in rows)
+        return found | {"revised": [{"row": row, "accepted": known[row].accepted} for row in self.revised]}
+
+    def _say(self, told: Entry) -> None:
+        """Print an answer."""
+        words = ["left out: " + told["error"]] if "error" in told else [told["text"]] if "text" in told else []
+        if "next" in told:
+            words.append(f"  {'; '.join(filter(None, self.words))}")
+        self.say("\n".join(words), told)
+
+    def state(self) -> Entry:
+        """The campaign in numbers, with what to measure next: joint values in the unit of the table."""
+        known, found, robot = self.campaign.expected_error, self.found, self.campaign.robot
+        entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
+        entry["expected_error_mm"] = None if known is None else 1e3 * known
+        if self.goal.error is not None:
+            entry |= {"more_rows": None if found is None else found.needed, "target_reached": self.reached()}
+        names = joint_columns(self.source.joints, robot)
+        columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.goal.poses]).tolist()
+        return entry | {"next": [dict(zip(names, q, strict=True)) for q in poses]}
+
+    @property
+    def found(self) -> Next | None:
+        """The next poses, and the forecast."""
+        now = len(self.campaign), self.campaign.models, len(self.campaign.accepted)
+        if self._found is None or self._found[0] != now:
+            self._found = now, self.campaign.next(max(self.goal.poses, 1), self.goal.error)
+        return self._found[1]
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """The expected error with the rows to the goal, and the next poses."""
+        state = self.state()
+        if state["expected_error_mm"] is None:
+            return "no model yet", ""
+        more = state.get("more_rows", "")
+        needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
+        poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
+        return f"{state['expected_error_mm']:.4g} mm expected{needed}", "; ".join(f"next: {pose}" for pose in poses)
+
+    def reached(self) -> bool:
+        """Whether the expected error is small enough."""
+        known, goal = self.campaign.expected_error, self.goal.error
+        return goal is not None and known is not None and known <= goal
+
+    def lines_of(self, rows: Sequence[int]) -> list[bytes]:
+        """The lines of some rows."""
+        return [self.lines[number] for number in dict.fromkeys(self.owner[row] for row in rows)]
+
+    def _read(self, lines: Sequence[bytes], header: bytes = b"") -> Any:
+        """Lines as a table, in their order."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / self.source.csv.name
+            path.write_bytes((header or self.table.header) + b"".join(lines))
+            data = replace(self.source, csv=path).read(self.campaign.robot, self.tips)
+        return data.rows(data.lines.argsort(stable=True))
+
+
+def expected(campaign: Campaign) -> str:
+    """The expected error in words; empty without one."""
+    known = campaign.expected_error
+    return "" if known is None else f", {1e3 * known:.4g} mm expected"

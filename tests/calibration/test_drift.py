@@ -1,0 +1,154 @@
+"""Drift with a column of times or temperatures: found where it is, left out where it is not, undone in other rows."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from again_bank import true_error
+from command_bank import Command
+from reading_bank import readings, scales
+from tangent_bank import normal
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.placing.drift import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
+from diffeo_calib.calibration.placing.placement import SeenRows
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.writing import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.geometry import Geometry
+
+ARM = SimulatedArm(seed=0)
+ROWS, OFFSET_RAD = 80, 4e-4
+
+
+def hours(count: int) -> Tensor:
+    """Times in random order, from 3 to 7 h."""
+    return 3.0 + 4.0 * torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def turned(q: Tensor, time: Tensor, offset: float = OFFSET_RAD) -> Tensor:
+    """Joint values whose second one is off by ``offset`` between the first hour and the last."""
+    moved = q.clone()
+    moved[:, 1] += offset * ((time - 3.0) / 4.0 - 0.5)
+    return moved
+
+
+def drifting_rows(offset: float = OFFSET_RAD) -> dc.Measurements:
+    q, time = ARM.sample(ROWS + 60, seed=4), hours(ROWS + 60)
+    points = ARM.true_points(turned(q, time, offset)) + 2e-5 * normal(ROWS + 60, 1, 3, seed=2)
+    return dc.Measurements(q, points, ARM.nominal.joint_names).with_covariates(time=time)
+
+
+def calibrated(data: object) -> dc.CalibrationResult:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return dc.calibrate(ARM.nominal, data, hyperparameters=scales())  # pyright: ignore[reportArgumentType]
+
+
+def drifts(result: dc.CalibrationResult) -> list[Drift]:
+    return [own for own in result.placement if isinstance(own, Drift)]
+
+
+def test_a_joint_offset_that_drifts_is_part_of_the_model() -> None:
+    data = drifting_rows()
+    train, other = data[:ROWS], data[ROWS:]
+    plain, result = calibrated(train.with_covariates()), calibrated(train)
+    (drift,) = drifts(result)
+    (line,) = drift.sentences()
+    found = re.search(f"the offset of {ARM.nominal.joint_names[1]} by ([^ ]+)", line)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1e3 * OFFSET_RAD, rel=0.3)
+    assert drifts(plain) == []
+    assert dc.evaluate(result.model, result.aligned(other)).rms < 0.7 * dc.evaluate(plain.model, other).rms
+    assert true_error(result.model, ARM) < true_error(plain.model, ARM)
+
+
+def test_a_column_with_which_nothing_drifts_changes_nothing() -> None:
+    train = drifting_rows(0.0)[:ROWS]
+    plain, result = calibrated(train.with_covariates()), calibrated(train)
+    assert drifts(result) == []
+    assert torch.equal(plain.model(train.q), result.model(train.q))
+
+
+def test_readings_show_a_drift_too() -> None:
+    time = hours(150)
+    still = readings(ARM, "height", 150)
+    moved = readings(ARM, "height", 150, noise=2e-5, turned=lambda q: turned(q, time, 2 * OFFSET_RAD))
+    data = dc.Readings.heights(still.q, moved.values[:, 0], moved.device_names, ARM.nominal.joint_names)
+    plain, result = calibrated(data), calibrated(data.with_covariates(time=time))
+    assert len(drifts(result)) == 1
+    assert true_error(result.model, ARM) < true_error(plain.model, ARM)
+
+
+def test_rows_are_brought_to_the_middle_of_the_column() -> None:
+    """Shift, turn, growth and offsets, written out: effects are their slopes, and `aligned` undoes them."""
+    q, time = ARM.sample(20, seed=3), hours(20)
+    geometry = Geometry.nominal(ARM.nominal, 2)
+    nominal = GeometryMap(geometry, elastic=True)
+    zero = torch.zeros(nominal.parameters, dtype=torch.float64)
+    unknowns = normal(13, seed=5)
+    size = unknowns * torch.tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * 6, dtype=torch.float64)
+    a = ((time - time.min()) / (time.max() - time.min()) - 0.5)[:, None]
+    plain = nominal(q, zero)
+    centre = plain.view(-1, 3).mean(0)
+    away = nominal(q + a * size[7:], zero).view(20, 2, 3) - centre
+    turn = torch.linalg.cross((a * size[3:6])[:, None].expand_as(away), away)
+    moved = away + centre + (a * size[:3])[:, None] + turn + (a * size[6])[..., None] * away
+    data = dc.Measurements(q, moved).with_covariates(time=time)
+    drift: Any = Drift.of_table(data, ARM.nominal)[0]
+    effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
+    assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
+    back = replace(drift, centre=centre, size_by_column=size[None], deviations=size[None].abs()).aligned(data)
+    assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
+
+
+def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
+    time, temperature = hours(12), 20.0 + hours(12)
+    q, points = ARM.measure(12, seed=1)
+    table = dc.Measurements(q, points, ARM.nominal.joint_names)
+    data = table.with_covariates(time=time, temperature=temperature)
+    heights = readings(ARM, "height", 12).with_covariates(time=time, temperature=temperature)
+    both = dc.Observations.joined([data, heights])
+    tables: tuple[Any, ...] = data, both
+    for rows in tables:
+        columns, form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
+        read: Any = read_observations(tmp_path / "t.csv", columns, form)
+        assert read.covariate_names == ("time", "temperature")
+        assert_close(read.covariates, rows.covariates, rtol=1e-12, atol=0)
+        assert_close(read.rows([3, 1]).covariates, rows.covariates[[3, 1]], rtol=1e-12, atol=0)
+    assert both.with_covariates().covariates is None
+    assert list(data.to_frame().columns)[-2:] == ["time", "temperature"]
+
+
+def test_columns_that_cannot_be() -> None:
+    q, points = ARM.measure(12, seed=1)
+    table = dc.Measurements(q, points)
+    with pytest.raises(MeasurementError, match="temperature"):
+        table.with_covariates(temperature=[1.0, 2.0])
+    with pytest.raises(MeasurementError, match="time"):
+        table.with_covariates(time=[float("nan")] * 12)
+    with pytest.raises(MeasurementError, match="covariate"):
+        dc.Measurements.joined([table, table.with_covariates(time=hours(12))])
+
+
+@pytest.mark.slow
+def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
+    form = TableFormat("mm", "deg", time="hour")
+    write_measurements(tmp_path / "t.csv", drifting_rows(), form)
+    ARM.write_urdf(tmp_path / "arm.urdf")
+    robot = "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"
+    columns = "--length", "mm", "--angle", "deg", "--position", "x,y,z", "--time", "hour"
+    done = command("fit", tmp_path / "t.csv", *robot, *columns, "-o", tmp_path / "m.safetensors")
+    assert done.code == 0
+    assert "drift with time" in done.out

@@ -1,0 +1,158 @@
+"""Rows over a socket: answered one by one, none lost by a cut connection, none taken in twice or by half."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_bank import Command, Outcome
+
+from diffeo_calib.campaign.feeds import listening
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.robots import SimulatedArm
+
+ARM = SimulatedArm(2)
+WORDS = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--base", "base_link", "--tip", "flange"]
+
+
+def row(number: int, **more: Any) -> bytes:
+    """A row as a line."""
+    q, y = ARM.measure(1, seed=number)
+    values = dict(zip([*ARM.nominal.joint_names, "x", "y", "z"], [*q[0].tolist(), *y[0, 0].tolist()], strict=True))
+    return (json.dumps({"id": number, **values, **more}) + "\n").encode()
+
+
+def free_port() -> int:
+    """Not one that the system gives to clients, which could then connect to themselves."""
+    for port in random.sample(range(20000, 30000), 100):
+        with socket.socket() as found, suppress(OSError):
+            found.bind(("127.0.0.1", port))
+            return port
+    raise OSError("no free port")
+
+
+class Client:
+    """A connection, after what it is told first."""
+
+    def __init__(self, port: int, first: bytes = b"") -> None:
+        for _ in range(600):
+            try:
+                self.socket = socket.create_connection(("127.0.0.1", port), timeout=60)
+                break
+            except ConnectionRefusedError:
+                time.sleep(0.05)
+        self.lines = self.socket.makefile("rwb")
+        if first:
+            self.write(first)
+        self.first = self.read()
+
+    def write(self, text: bytes) -> None:
+        self.lines.write(text)
+        self.lines.flush()
+
+    def read(self) -> dict[str, Any]:
+        return json.loads(self.lines.readline() or b"{}")
+
+    def ask(self, text: bytes) -> dict[str, Any]:
+        self.write(text)
+        return self.read()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.cut()
+
+    def cut(self) -> None:
+        self.lines.close()
+        self.socket.close()
+
+
+@pytest.fixture
+def run(tmp_path: Path, command: Command) -> Callable[..., tuple[Outcome, Any]]:
+    """Runs a campaign that listens beside a client, which ends it by Ctrl-C."""
+    ARM.write_urdf(tmp_path / "robot.urdf")
+
+    def both(client: Callable[[int], Any], *words: str) -> tuple[Outcome, Any]:
+        port = free_port()
+
+        def ended() -> Any:
+            try:
+                return client(port)
+            finally:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        with ThreadPoolExecutor() as pool:
+            found = pool.submit(ended)
+            robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
+            done = command("campaign", tmp_path / "run.csv", *robot, "--listen", port, *words)
+        return done, found.result()
+
+    return both
+
+
+def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[..., tuple[Outcome, Any]]) -> None:
+    def client(port: int) -> list[dict[str, Any]]:
+        with Client(port) as one:
+            answers = [one.first, one.ask(row(0)), one.ask(row(1))]
+            one.write(row(2))  # nobody knows whether it arrives
+        with Client(port) as two:
+            answers += [two.ask(row(2)), two.ask(row(3))]
+            two.write(row(4)[:-20])  # half a line
+        with Client(port) as one, Client(port) as two:
+            answers += [one.ask(row(5)), two.ask(row(6)), one.ask(row(7, unknown=1)), one.ask(row(8, x="wide"))]
+            answers += [two.ask(b'{"do": "reject", "row": %d}\n' % number) for number in (9, 1)]
+            return [*answers, two.ask(b"{}\n"), one.ask(b"GET / HTTP/1.1\n"), one.read()]
+
+    done, (first, *answers) = run(client)
+    assert done.code == 130
+    assert (first["rows"], first["next"]) == (0, [])
+    assert [(one["id"], one["line"], one["row"]) for one in answers[:6]] == [
+        *((number, number + 2, number) for number in range(4)),
+        (5, 6, 4),
+        (6, 7, 5),
+    ]
+    assert all(one["fits"] is None and one["accepted"] for one in answers[:6])
+    for one, words in zip(answers[6:9], ("columns unknown", "wide", "0 to 5"), strict=True):
+        assert words in one["error"], one
+    assert answers[9]["accepted_rows"] == answers[10]["accepted_rows"] == 5
+    assert "JSON" in answers[11]["error"]
+    assert answers[12] == {}
+    table = (tmp_path / "run.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table] == ["id", "0", "1", "2", "3", "5", "6"]
+    assert (tmp_path / "accepted.csv").read_text().splitlines() == table[:2] + table[3:]
+
+    def again(port: int) -> dict[str, Any]:
+        with Client(port) as one:
+            return one.ask(row(6))
+
+    _, answer = run(again, "--json-lines")
+    assert (answer["line"], answer["row"], answer["accepted_rows"]) == (7, 5, 5)
+
+
+def test_a_token_is_asked_for(run: Callable[..., tuple[Outcome, Any]]) -> None:
+    def client(port: int) -> list[dict[str, Any]]:
+        words = b'{"token": "secret"}\n', b'{"token": "no"}\n', row(1)
+        with Client(port, words[0]) as known, Client(port, words[1]) as other, Client(port, words[2]) as third:
+            return [known.first, known.ask(row(0)), other.first, third.first]
+
+    _, (first, answer, *others) = run(client, "--token", "secret", "--json-lines")
+    assert first["rows"] == 0
+    assert answer["accepted"]
+    assert all("token" in one["error"] for one in others)
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:0", "example.org:1", "x", "70000"])
+def test_addresses_that_are_refused(address: str) -> None:
+    with pytest.raises(InputError), listening(address, "", None):  # pyright: ignore[reportArgumentType]
+        pass
