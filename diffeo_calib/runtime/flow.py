@@ -6,7 +6,7 @@ of the Runge-Kutta run that moved the controls (flows/geodesic.py).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -218,14 +218,14 @@ class RecordedFlow:
             slopes: list[Array] = []
             turns: list[Array] = []
             for stage, row in enumerate(coefficients, step * len(weights)):
-                at = _combined(x, row, slopes)
+                at = combined(x, row, slopes)
                 if M is None:
                     slopes.append(self.velocity(stage, at))
                     continue
                 v, dv = self.velocity_and_jacobian(stage, at)
                 slopes.append(v)
-                turns.append(dv @ _combined(M, row, turns))
-            x, M = _combined(x, weights, slopes), M if M is None else _combined(M, weights, turns)
+                turns.append(dv @ combined(M, row, turns))
+            x, M = combined(x, weights, slopes), M if M is None else combined(M, weights, turns)
         return x, M
 
     def _blocks(self, rows: int) -> Iterator[slice]:
@@ -247,7 +247,7 @@ class RecordedFlow:
         return [] if self.tables is None else list(self.tables.joints)
 
 
-def _combined(x: Array, coefficients: Sequence[float], slopes: Sequence[Array]) -> Array:
+def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:
     """x + sum_k c_k slope_k."""
     for c, slope in zip(coefficients, slopes, strict=False):
         if c:
