@@ -16,7 +16,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.placing.place import Placed
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.placing.readings import ReadingDevices
-from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
@@ -96,9 +96,9 @@ class CalibrationResult:
         return self.placed.placement
 
     @property
-    def sessions(self) -> SessionFrames | None:
-        """Measuring frames of the sessions, if the measurements name several."""
-        return self.placement.one(SessionFrames)
+    def sessions(self) -> Any:
+        """Measuring frames, or markers, of the sessions, if the measurements name several; None otherwise."""
+        return self.placement.one(Sessions)
 
     @property
     def sockets(self) -> SocketDevices | None:

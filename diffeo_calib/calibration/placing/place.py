@@ -30,7 +30,7 @@ from diffeo_calib.calibration.placing.readings import (
     with_ball_of,
     with_freed_devices,
 )
-from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -307,7 +307,7 @@ def _by_coordinates(
     """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
     count = len(data)
     own.table.check_every_marker_seen()
-    sessions, table = SessionFrames.of_table(robot, own, count, progress)
+    sessions, table = Sessions.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
