@@ -10,6 +10,7 @@ device stayed, and the markers alone were mounted anew, their shifts are found i
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, SeenRows, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -241,6 +242,15 @@ class SessionFrames(Sessions):
             step[:3, 3] = centre + PLACES.session_m_rad * own[:3] - step[:3, :3] @ centre
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
+
+    def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
+        """See :class:`DeviceSet`."""
+        session, points, count = self.session[own.rows], own.table.points, self.markers
+        for number, name in enumerate(self.names):
+            T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
+            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - seen[:, :count]
+            applies = (session != number) & (session != NO_SOCKET)
+            yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""
