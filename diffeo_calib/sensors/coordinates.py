@@ -126,7 +126,7 @@ class Positions(Sensor):
         """The frames of several set-ups, or of rows that no device shares with the model."""
         names = {name for name in data.device_names if name}
         if data.remounted:
-            return self._mounted(data, beside)
+            return self._mounted(data, beside, names)
         if len(names) == 1 and names <= set(beside.frames) and not beside.every_session:
             (name,) = names
             return Places(SessionPlaces((name,), beside.frames[name][None]))
@@ -139,13 +139,13 @@ class Positions(Sensor):
         found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.sentences()
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
 
-    def _mounted(self, data: Measurements, beside: Beside) -> Places:
+    def _mounted(self, data: Measurements, beside: Beside, names: set[str]) -> Places:
         """The markers of set-ups between which they were mounted anew: those that are known, the others anew."""
         known = beside.mounted
         if known is None:
             what = "rows whose markers were mounted anew"
             raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
-        if not set(data.session_names) <= set(known.names):
+        if not names <= set(known.names):
             found = MountedMarkers.of(beside.points(data), data, known.turns)
             known = known.beside(found) if known.names else found
         return Places(known, found=tuple(known.sentences()), numbers=known.fitted_numbers)

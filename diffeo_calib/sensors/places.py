@@ -89,13 +89,7 @@ def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
     Raises:
         MeasurementError: no sessions, or fewer than 4 rows in one.
     """
-    if data.session is None:
-        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-    present = data.session[data.session != NO_SOCKET].unique().tolist()
-    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
-    for place, number in enumerate(present):
-        own[data.session == number] = place
-    check_rows_of_sessions(own, names)
+    names, own = sessions_of(data)
     predicted = predicted[:, : data.markers]
     rows = [(own == place).to(predicted.device) for place in range(len(names))]
     found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
@@ -122,13 +116,10 @@ class MountedMarkers:
     @classmethod
     def of(cls, predicted: Tensor, data: Measurements, turns: Turns) -> MountedMarkers:
         """The sessions of some rows where these fit points (N, P, 3) of the model's markers best, m; see the class."""
-        whose, names = data.session, data.session_names
-        if whose is None:
-            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+        names, whose = sessions_of(data)
         P = min(data.markers, predicted.shape[1])
         away = turns(data.q)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
         found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
-        check_rows_of_sessions(whose, names)
         shifts, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
         return cls(names, shifts, deviations, turns, names)
 
@@ -182,13 +173,23 @@ def mounted_sentences(names: Sequence[str], shifts: Tensor, deviations: Tensor) 
     return lines
 
 
-def check_rows_of_sessions(session: Tensor, names: tuple[str, ...]) -> None:
-    """Raise MeasurementError for a session of too few rows: (N,) their numbers, -1 for none, and names."""
-    counts = torch.bincount(session[session != NO_SOCKET], minlength=len(names))
-    for name, count in zip(names, counts.tolist(), strict=True):
-        if count < FEWEST_ROWS:
-            fix = "measure more rows in it, or leave it out"
-            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=count, fix=fix)
+def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
+    """Names of the sessions of some rows, and (N,) the number of each row's, -1 for none.
+
+    Raises:
+        MeasurementError: no sessions, or fewer than 4 rows in one.
+    """
+    if data.session is None:
+        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+    present = data.session[data.session != NO_SOCKET].unique().tolist()
+    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
+    for place, (number, name) in enumerate(zip(present, names, strict=True)):
+        rows = data.session == number
+        own[rows] = place
+        if int(rows.sum()) < FEWEST_ROWS:
+            fix, got = "measure more rows in it, or leave it out", int(rows.sum())
+            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
+    return names, own
 
 
 def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:

@@ -65,6 +65,9 @@ def test_rows_of_known_and_of_new_sessions_are_judged(result: dc.CalibrationResu
     assert placed.numbers == 9
     assert placed.rms < 1.2 * plain.rms
     assert any("session 'b again': its marker is" in text for text in placed.placed)
+    alone: Any = dc.evaluate(model, new.rows(slice(1, None, 5)))  # the second session, whose name the others keep
+    assert (alone.count, alone.numbers) == (8, 0)
+    assert alone.rms < 1.5 * plain.rms
     assert dc.evaluate(model, new.with_sessions(None)).rms > 2e-3
     with pytest.raises(InputError, match="mounted anew"):
         dc.evaluate(result.identification.geometry.points, new)

@@ -37,9 +37,9 @@ from diffeo_calib.sensors.places import (
     SESSION,
     MountedMarkers,
     PlacedDevices,
-    check_rows_of_sessions,
     mounted_sentences,
-    robust_fit,
+    place_sessions,
+    sessions_of,
 )
 from diffeo_calib.sensors.tables import Coordinates, measured_rows
 
@@ -97,8 +97,7 @@ class Sessions(DeviceSet):
         Raises:
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
-        session, _ = _sessions(data)
-        reference = reference_of(data)
+        session, reference = sessions_of(data)[1], reference_of(data)
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
         found = cls.around(data, geometry, reference)
         for _ in range(ROUNDS - 1):  # a better geometry gives better places
@@ -170,13 +169,15 @@ class Sessions(DeviceSet):
 
     def numbers(self, data: Any) -> Tensor:
         """(N,) number here of each row's session, -1 for none; MeasurementError for a session that is not known."""
-        own, names = _sessions(data)
-        unknown = [names[n] for n in own.unique().tolist() if n != NO_SOCKET and names[n] not in self.names]
+        if data.session is None:
+            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+        names = data.device_names
+        unknown = [name for name in dict.fromkeys(names) if name and name not in self.names]
         if unknown:
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        known = [*(self.names.index(name) if name in self.names else NO_SOCKET for name in names), NO_SOCKET]
-        return torch.tensor(known, dtype=torch.int64, device=HOST)[own]
+        known = [self.names.index(name) if name else NO_SOCKET for name in names]
+        return torch.tensor(known, dtype=torch.int64, device=HOST)
 
     def of_rows(self, rows: Tensor, count: int) -> Self:
         """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
@@ -205,8 +206,9 @@ class SessionFrames(Sessions):
     @classmethod
     def of_points(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
         """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m."""
-        session, names = _sessions(data)
-        transforms = _frames(seen, data, session, len(names), reference)
+        names, session = sessions_of(data)
+        transforms = place_sessions(seen, data).transforms
+        transforms[reference] = torch.eye(4, dtype=transforms.dtype, device=HOST)
         return cls(names, reference, session, data.markers, transforms)
 
     def aligned(self, data: Any) -> Any:
@@ -295,7 +297,7 @@ class Mountings(Sessions):
         found = MountedMarkers.of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
         other = torch.arange(len(found.names), device=HOST)[:, None, None] != reference
         found = replace(found, shifts=found.shifts * other, deviations=found.deviations * other, new=())
-        return cls(found.names, reference, _sessions(data)[0], found.shifts.shape[1], found)
+        return cls(found.names, reference, sessions_of(data)[1], found.shifts.shape[1], found)
 
     def aligned(self, data: Any) -> Any:
         """See :class:`Sessions`."""
@@ -359,22 +361,5 @@ def _largest_median(robot: Tree, data: Measurements, sessions: Sessions) -> floa
 
 def reference_of(data: Measurements) -> int:
     """Number of the largest session; MeasurementError for a session with too few rows."""
-    session, names = _sessions(data)
-    check_rows_of_sessions(session, names)
-    return int(torch.bincount(session, minlength=len(names)).argmax())
-
-
-def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:
-    if data.session is None:
-        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-    return data.session, data.session_names
-
-
-def _frames(seen: Tensor, data: Measurements, session: Tensor, count: int, reference: int) -> Tensor:
-    """Rigid fits of every session's rows to the robot in the frame of the reference, without gross outliers."""
-    found = torch.eye(4, dtype=data.points.dtype, device=HOST).repeat(count, 1, 1)
-    for number in range(count):
-        if number != reference:
-            own = session == number
-            found[number] = robust_fit(seen[own], data.points[own])
-    return found
+    names, session = sessions_of(data)
+    return int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
