@@ -28,7 +28,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
-from diffeo_calib.kernels.profiles import PROFILES, Profile
+from diffeo_calib.kernels.profiles import SHIPPED, Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program, SymbolicPairs
 from diffeo_calib.kernels.reductions.fused.symbols import Code, Vector
@@ -148,8 +148,6 @@ MOST_INPUTS = 64
 MOST_VARIANTS = 64
 """Sums with profiles of one class of the user's that are compiled. With more, a parameter is being optimised, and
 compiling takes too long."""
-SHIPPED = {type(profile) for profile in PROFILES.values()}
-"""Classes of profiles that always compute the same."""
 
 
 class _Lines(NamedTuple):
