@@ -48,6 +48,7 @@ def test_errors_are_loaded_without_torch() -> None:
 
 def test_every_public_name_is_loaded_and_listed() -> None:
     assert set(dc.__all__) <= set(dir(dc))
+    assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))
     for name in dc.__all__:
         assert getattr(dc, name).__module__.startswith("diffeo_calib.")
     assert len(set(dc.__all__)) == len(dc.__all__)

@@ -6,6 +6,7 @@ import base64
 import csv
 import html
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,10 +56,14 @@ class Folder:
         """Images that show the board."""
         return [one for one in self.images if not one.refused]
 
-    def rows(self, per_metre: float) -> list[list[str]]:
-        """Cells of every corner: image, joints, place on the board in units per metre, pixels."""
+    def rows(self, per_metre: float, decimal: str = ".") -> list[list[str]]:
+        """Cells of every corner: image, joints as read, place on the board in units per metre, pixels."""
+
+        def written(values: Iterable[float]) -> list[str]:
+            return [repr(float(value)).replace(".", decimal) for value in values]
+
         return [
-            [one.name, *one.cells, *(repr(float(value)) for value in (*(per_metre * self.board.points[k, :2]), *uv))]
+            [one.name, *one.cells, *written([*(per_metre * self.board.points[k, :2]), *uv])]
             for one in self.used
             for k, uv in zip(one.numbers.tolist(), one.pixels.tolist(), strict=True)
         ]

@@ -42,6 +42,9 @@ def fit_command(
 
     Rows may hold anything that was measured: positions, poses, a ball in sockets, readings of devices. The model is
     fitted to the rows that are not held out: its held-out errors are those in the table.
+
+    A campaign file (`diffeo-calib fit campaign.toml`, see `init`) may take the place of CSV: it can hold all options,
+    the required ones too; those that are typed as well win.
     """
     outputs = {"-o": output, "--figure": given.figure, "--report": given.report}
     others = given.scales_of or []
@@ -69,8 +72,11 @@ def campaign_command(
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and the
     best poses to measure next. A journal beside the table keeps what was decided: after a crash the same command goes
     on where it stopped. Ends with exit code 0 when --target is reached, 4 if the rows end before.
+
+    A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
+    options, the required ones too; those that are typed as well win.
     """
-    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot})
+    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot}, may_come="CSV")
     from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
@@ -133,37 +139,18 @@ def images_command(
             help="Table of joint values; its column `image` names files, else rows are in their order.",
         ),
     ],
-    board: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="BOARD",
-            help="Lengths in m: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner corners), "
-            "aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
-        ),
-    ],
-    length: Annotated[options.Length, typer.Option("--length", help="Unit of places on the board in the output.")],
+    given: options.BoardImages,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table of corners to write.")],
-    board_std: Annotated[
-        float,
-        typer.Option(
-            "--board-std", help="Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured."
-        ),
-    ] = 1e-3,
-    overview: Annotated[
-        Path | None, typer.Option("--overview", metavar="HTML", help="Write a page with all images and their corners.")
-    ] = None,
-    sep: Annotated[str, typer.Option("--sep", help="Separator of both tables.")] = ",",
 ) -> None:
     """Find a printed board in a folder of images.
 
     Writes a line for each corner, and beside the table a file .yaml of the camera, for `fit --reading corners=FILE`.
     Images that do not show the board are named with the reason and left out.
     """
-    check_outputs({"-o": output, "--overview": overview}, {"JOINTS": joints})
+    check_outputs({"-o": output, "--overview": given.overview}, {"FOLDER": folder, "JOINTS": joints})
     from diffeo_calib.cli.commands import images  # noqa: PLC0415
 
-    images.run(folder, joints, images.Wanted(board, length.value, board_std, sep), output, overview)
+    images.run(folder, joints, given, output)
 
 
 @command("predict")
@@ -319,7 +306,7 @@ def recalibrate_command(
         options.Drift,
         typer.Option("--drift", help="tested: what a test names may have changed; none: device and markers only."),
     ] = options.Drift.tested,
-    seed: options.Seed = 0,
+    seed: options.TestSeed = 0,
     note: options.Note = "",
 ) -> None:
     """Calibrate a robot anew, starting from an old model.
@@ -353,7 +340,7 @@ def compare_command(
             "--level", min=0.001, max=0.2, help="Probability that anything is named although nothing changed."
         ),
     ] = 0.01,
-    seed: options.Seed = 0,
+    seed: options.TestSeed = 0,
     figure: Annotated[
         Path | None, typer.Option("--figure", metavar="IMAGE", help="With a model: draw where the two differ.")
     ] = None,

@@ -99,7 +99,7 @@ CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a heade
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
 OldModel = Annotated[Path, typer.Argument(metavar="OLD", help="Model file of an earlier calibration.")]
 ModelOutput = Annotated[Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the split.")]
+TestSeed = Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the tests for changes.")]
 Note = Annotated[
     str, typer.Option("--note", metavar="TEXT", help="Text to keep in the model file, such as a serial number.")
 ]
@@ -124,7 +124,7 @@ Convention = Annotated[
     ),
 ]
 RotationAngle = Annotated[
-    Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles, rotation vectors and --rotation-std.")
+    Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles and rotation vectors.")
 ]
 Tip = Annotated[
     list[str],
@@ -203,6 +203,7 @@ class Rows:
         "KIND=COLUMN",
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
+    remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
     payload: PayloadColumn = None
     time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
     temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
@@ -227,7 +228,7 @@ class Rows:
     )
     rotation_std: list[str] | None = option(
         "Columns with standard deviations of the rotation about the measuring frame's axes, or one for all "
-        "three; once per --rotation.",
+        "three, in the unit of --rotation-angle; once per --rotation.",
         "A,B,C",
     )
 
@@ -252,7 +253,7 @@ class Robot:
     robot: Path = option("The robot's description.", "URDF", default=...)
     base: str = option("First link of the chain.", "LINK", default=...)
     tip: Tip
-    load: list[str] | None = option("Link of another branch, whose weight bends the robot; repeat for more.", "LINK")
+    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +263,7 @@ class FitOptions:
     holdout: float = option(
         "Fraction of the rows that are not fitted but test the model; 0 for none.", min=0.0, max=0.9, default=0.3
     )
-    seed: Seed = 0
+    seed: int = option("Seed of the split.", min=0, max=LARGEST_SEED, default=0)
     controls: int | None = option(
         "Number of rows that carry the deformation; by default all, or 200 of a large table.", min=10
     )
@@ -270,7 +271,9 @@ class FitOptions:
     report: Path | None = option("Also write the report: one page that needs neither a network nor a server.", "HTML")
     note: Note = ""
     scales_of: list[Path] | None = option(
-        "Model of another robot of the same type, whose scales are used: for few rows. May be repeated.", "MODEL"
+        "For few rows: take the size of every kind of error, and of the noise, from the model of another robot of the "
+        "same type instead of estimating it. May be repeated.",
+        "MODEL",
     )
 
 
@@ -336,6 +339,25 @@ class Page:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class BoardImages:
+    """A printed board in images, and the tables of joint values and corners."""
+
+    board: str = option(
+        "Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner "
+        "corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
+        "BOARD",
+        default=...,
+    )
+    length: Length = option("Unit of places on the board in the output.", default=...)
+    board_std: float = option(
+        "Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured.", default=1e-3
+    )
+    overview: Path | None = option("Write a page with all images and their corners.", "HTML")
+    sep: str = option("Separator of both tables.", default=",")
+    decimal: str = option("Decimal mark of both tables.", default=".")
+
+
 # --- the commands that apply models -------------------------------------------------------------------------------
 
 
@@ -362,7 +384,9 @@ class Correction:
     )
     tool_from: ToolFromOption = ToolFrom.tip
     frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default=Frame.base)
-    limit: float | None = option("Largest correction of a joint in degrees; 1 by default (slides: 20 mm).", "DEG")
+    limit: float | None = option(
+        "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
+    )
     rate: float | None = option(
         "The rows are a path: the correction of a joint changes by at most so many degrees from row to row.", "DEG"
     )
@@ -434,7 +458,7 @@ class Candidates:
         "With --tracker: direction in which the marker looks, in the frame of the tip; 0,0,1 by default.", "X,Y,Z"
     )
     cone: float | None = option(
-        "With --tracker: largest angle between that direction and the line to the device, "
+        "With --tracker: largest angle in degrees between that direction and the line to the device, "
         f"{FACING_HALF_ANGLE_DEG:g} by default.",
         "DEG",
     )

@@ -175,13 +175,14 @@ def _version() -> str:
         return "unknown"
 
 
-def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
+def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path], *, may_come: str | None = None) -> None:
     """Refuse files that cannot be written, that are also read, or that are named twice, and unknown kinds of images.
 
-    --json is one of the files.
+    --json is one of the files. Files that are read must exist, which is known at once, before anything is loaded.
 
     Args:
         outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
+        may_come: the argument whose file may not exist yet.
 
     Raises:
         InputError: with the option and its file.
@@ -195,6 +196,10 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> N
         _check(option, path, taken)
         taken[option] = path
     check_figure(outputs.get("--figure"))
+    for name, path in inputs.items():
+        if name != may_come and not os.path.lexists(path):
+            kind = "model file" if name in ("MODEL", "OLD") else "file"
+            raise InputError.of(f"there is no {kind} {path}", fix=f"check the path of {name}")
 
 
 def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:

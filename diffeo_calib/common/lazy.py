@@ -28,4 +28,8 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str]
         setattr(own, name, value)
         return value
 
-    return load, lambda: sorted({*vars(own), *module_of, *folders})
+    def listed() -> list[str]:
+        """Without what the package itself imports."""
+        return sorted({*(name for name in vars(own) if name.startswith("__")), *own.__all__, *module_of, *folders})
+
+    return load, listed

@@ -80,9 +80,8 @@ def fit(
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: for a coarse model of many measurements, the number of configurations that carry momenta (chosen from
             x by pivoted Cholesky factorisation of the prior covariance), or the configurations (M, n). Default: all.
-        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device; "distributed" shares them
-            among the processes of a program that torchrun starts, which must all make this call with the same data,
-            and later the same queries to the model.
+        backend: of the kernel sums, see :meth:`Kernel.using`; with "distributed" all processes must make this call
+            with the same data, and later the same queries to the model.
         accuracy: allows large kernel sums an error of this size, relative to the sum of the momenta's absolute values:
             for smooth kernels of few coordinates they then go by plane waves, in a time that grows with the number of
             points, not of pairs, and those of short kernels over nearby pairs. Default: all pairs.

@@ -43,7 +43,8 @@ class LBFGS:
         max_iterations: upper bound on L-BFGS iterations.
         tolerance: stop when the relative fall of the energy in 5 iterations is below it.
         history_size: number of stored update pairs.
-        preconditioned: whether to descend in the variables w above, which need a Cholesky factor of (N m)^2 numbers.
+        preconditioned: whether to descend in variables in which the linearised problem is well-conditioned (see the
+            module), rather than in the momenta; they need a Cholesky factor of (N m)^2 numbers.
         integrator: time stepping, unless it is passed to :func:`fit`.
     """
 

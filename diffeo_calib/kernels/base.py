@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from functools import reduce
+from functools import cache, reduce
 from inspect import Parameter, signature
 from itertools import chain
 from typing import Any
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 
 PROBE_POINTS = 3
@@ -58,6 +58,7 @@ class Kernel(ABC):
             q: (N, n).
             a: (N, n); momenta (N, k, n) give k fields at once, (M, k, n).
         """
+        check_momenta(q, a)
         x = q if x is None else x
         n = q.shape[1]
         columns = a.reshape(len(q), -1, n).mT.reshape(len(q) * n, -1)  # (N n, k)
@@ -153,13 +154,19 @@ class Kernel(ABC):
         raise InputError.of(f"{type(self).__name__} cannot be scaled", fix="write its method `scaled(factor)`")
 
     def using(self, backend: Backend, accuracy: float | None = None) -> Kernel:
-        """The same kernel with its sums evaluated by this backend; the default always uses the dense matrix.
+        """The same kernel with its sums evaluated by this backend.
+
+        A kernel of your own always uses the dense matrix, and warns of another backend. If it is radial, make it a
+        :class:`~diffeo_calib.kernels.radial.RadialKernel` of a :class:`~diffeo_calib.kernels.profiles.Profile`: it then
+        has all backends.
 
         Args:
+            backend: "auto", "dense", "fused", "tiled", "keops" or "distributed": see the table in
+                :mod:`diffeo_calib.kernels.reductions.backends`.
             accuracy: error that large sums may have, relative to the sum of the momenta's absolute values.
         """
-        check_backend(backend)
-        check_accuracy(accuracy)
+        if check_backend(backend) not in ("auto", "dense") or check_accuracy(accuracy) is not None:
+            _warn_of_dense_sums(type(self).__name__)
         return self
 
     def backends(self, count: int, device: torch.device) -> set[str]:
@@ -195,6 +202,20 @@ class Kernel(ABC):
 
     def __add__(self, other: Kernel) -> Kernel:
         return SumKernel([self, other])
+
+
+@cache
+def _warn_of_dense_sums(name: str) -> None:
+    """Warn, once for every class, that its sums have one backend."""
+    fix = "if it is radial, use RadialKernel with a Profile, which have all backends"
+    warn_user(sentence(f"{name} is a kernel of your own: its sums always use the dense matrix", fix=fix))
+
+
+def check_momenta(q: Tensor, a: Tensor) -> None:
+    """Raise InputError unless points (N, n) have momenta (N, n) or (N, k, n)."""
+    if a.shape[:1] != q.shape[:1] or a.shape[-1:] != q.shape[-1:]:
+        expected = f"a row of {q.shape[-1]} numbers for each of the {len(q)} points `q`"
+        raise InputError.of("the momenta `a`", expected=expected, got=f"shape {tuple(a.shape)}")
 
 
 class DiagonalKernel(Kernel):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive, wrapped
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, diagonal_gram
+from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, check_momenta, diagonal_gram
 from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
@@ -186,6 +186,7 @@ class RadialKernel(DiagonalKernel):
 
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
+        check_momenta(q, a)
         n, rows = q.shape[-1], (q if x is None else x).shape[0]
         if self._field_vanishes(a):
             return a.new_zeros(rows, *a.shape[1:])

@@ -27,7 +27,7 @@ LARGEST_POSITION_M = 100.0
 SMALLEST_POSITION_MM = 10.0
 """Few measurement volumes are smaller, so smaller values are probably metres."""
 SMALLEST_SLIDE_MM = 2.0
-"""Few slides move less, so smaller values are probably metres."""
+"""Few prismatic joints move less, so smaller values are probably metres."""
 LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
 """No rotation is written with larger values, apart from rounding."""
 

@@ -32,8 +32,8 @@ from diffeo_calib.measurements.rows import RowTable, exact_copies, set_attribute
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
 FLATTERY = (
-    "errors of readings flatter: what no reading shows, such as the robot's size with devices that hold no length, is "
-    "not in them; choose nothing by them"
+    "errors of readings are smaller than the true error: what no reading shows, such as the robot's size with devices "
+    "that hold no length, is not in them; choose nothing by them"
 )
 ONE_DEVICE = "device"
 """Name of the device of all rows, where none is given."""

@@ -29,8 +29,8 @@ Distances = Mapping[tuple[str, str], float]
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+    "the spread within sockets is smaller than the true error: it contains neither errors that all rows of a socket "
+    "share nor the robot's size, so that absolute errors are 2 to 6 times as large; choose nothing by it"
 )
 
 
@@ -90,6 +90,7 @@ class SocketTable(RowTable):
     on: tuple[str, ...] | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    remounted: bool
     socket: Tensor | None
     sockets: Sockets | None
 
@@ -225,6 +226,7 @@ class SocketTable(RowTable):
         changes: dict[str, object] = {"marker_names": other.marker_names, "on": other.on}
         changes |= {} if other.std is None else {"std": torch.full_like(shown.points, torch.nan)}
         changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
+        changes["remounted"] = other.remounted
         return with_attributes(shown, **changes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import cos, isfinite, sin
+from math import cos, isfinite, pi, sin
 from typing import Any
 
 import torch
@@ -12,12 +12,15 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import index_of
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import RobotError, as_written
+from diffeo_calib.common.errors import RobotError, as_written, sentence, warn_user
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Chain, Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
+LARGEST_ANGLE_RAD = 2 * pi + 1e-6
+LONGEST_LINK_M = 20.0
+"""Longer ones are probably in millimetres."""
 ENTRIES, MOST_ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])", 7
 
 
@@ -71,16 +74,20 @@ def from_dh(
         convention: ``"standard"`` or ``"craig"`` (also called modified).
         names: one name per joint; by default ``joint_1``, ``joint_2``, ...
         name: the robot's name.
-        tips: for a robot with branches, name of every tip -> number of its row. The ends of other branches only weigh,
-            under the names of their joints. By default all ends are tips: ``"tip_1"``, ``"tip_2"``, ...
+        tips: for a robot with branches, name of every tip -> number of its row. Other branches carry no markers
+            but bend the robot by their weight, and their ends have the names of their joints. By default all ends are
+            tips: ``"tip_1"``, ``"tip_2"``, ...
 
     Returns:
         The chain from ``"base"`` to ``"tip"``; a :class:`Tree` if rows branch or ``tips`` are named.
 
     Raises:
-        RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind, not one
-            name per row, a row that follows itself or a later one, a tip that is no row, or a mimic that :class:`Joint`
-            or :class:`Tree` refuses.
+        RobotError: no row, a row of the wrong length, numbers that are not finite, angles above 2 pi, unknown
+            convention or kind, not one name per row, a row that follows itself or a later one, a tip that is no row, or
+            a mimic that :class:`Joint` or :class:`Tree` refuses.
+
+    Warns:
+        DiffeoCalibWarning: lengths above 20 m.
     """
     if convention not in CONVENTIONS:
         raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
@@ -155,12 +162,25 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
         raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
+    _check_units(what, numbers)
     parent = index_of(row.parent)
     if row.parent is not None and (parent is None or not -1 <= parent < index):
         expected = "the number of an earlier row, or -1 for the base"
         raise RobotError.of(f"the parent in {what}", expected=expected, got=as_written(row.parent))
     others = {"mimic": row.mimic, "mimic_offset": row.mimic_offset, "parent": parent}
     return DHRow(*numbers[:4], kind=row.kind, beta=numbers[4], **others)
+
+
+def _check_units(what: str, row: Sequence[float]) -> None:
+    """Refuse degrees, and warn of millimetres, in a, alpha, d, theta, beta."""
+    a, alpha, d, *others = row
+    angle = max(alpha, *others, key=abs)
+    if abs(angle) > LARGEST_ANGLE_RAD:
+        fix = "convert degrees: math.radians(90)"
+        raise RobotError.of(f"an angle in {what}", expected="rad, at most 2 pi", got=f"{angle:g}", fix=fix)
+    length = max(a, d, key=abs)
+    if abs(length) > LONGEST_LINK_M:
+        warn_user(sentence(f"a length in {what} is {length:g} m", fix="divide by 1000 if it is in mm"))
 
 
 def _standard(row: DHRow, name: str) -> list[Joint]:

@@ -48,7 +48,7 @@ class GravitySag:
 
     Args:
         chain: the nominal robot; its nominal frames make the features.
-        payload: masses at a tip or at a branch that only weighs; None without.
+        payload: masses at a tip or at a branch without markers (`load`); None without.
 
     Raises:
         InputError: a payload at another link.
@@ -95,7 +95,7 @@ class GravitySag:
         return torch.arange(self.size, dtype=torch.int64, device="cpu") % 3
 
     def features(self, q: Tensor) -> Tensor:
-        """Feature values [m; 1 for forces on slides]: q (N, n) -> (N, K)."""
+        """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
         frames, (numbers, places) = self._frames(q), self._loads.to(q.device)
         sag = self._sag(q.new_zeros(self.size))
         origins, joints = frames[..., :3, 3], sag.joints[numbers]
@@ -204,7 +204,7 @@ def _column(values: Sequence[Any], dtype: torch.dtype) -> Tensor:
 def _under_payload(chain: Tree, link: str) -> list[Compliance]:
     """The compliances of a robot under a load at one link, where they carry it."""
     if link not in chain.ends:
-        fix = "name a tip, or a branch that only weighs (`load`)"
+        fix = "name a tip, or the end of a branch that was given as `load`"
         raise InputError.of("the link of the payload", expected=" or ".join(chain.ends), got=link, fix=fix)
     place = chain.moving + list(chain.ends).index(link)
     seen, moved = _representative(chain, place), chain.arrays.seen_from_ground[0][place]

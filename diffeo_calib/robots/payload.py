@@ -24,7 +24,7 @@ class Payload:
     """Masses at one place of a robot.
 
     Args:
-        link: name of the tip, or of the branch that only weighs, at whose origin the mass sits.
+        link: name of the tip, or of the branch without markers (`load`), at whose origin the mass sits.
         masses: of the robot everywhere (), or of N rows (N,), in any unit.
         unit: the mass, in the same unit, that counts as one: coefficients are sags under it.
 
@@ -217,7 +217,8 @@ def words_of_mass(mass: float | None) -> str:
 def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> Tree:
     """The same robot with a weight beside the links of its description, for the place of a payload.
 
-    It is a branch that only weighs, as `load` of :func:`load_urdf`: exports that know serial robots only refuse it.
+    It is a branch without markers whose weight bends the robot, as `load` of :func:`load_urdf`: exports that know
+    serial robots only refuse it.
 
     Args:
         robot: the robot. name: of the new place, for :meth:`Measurements.with_payload`.

@@ -269,7 +269,7 @@ class Tree:
         """Geometric Jacobian (N, 6, n) at the tip's origin by the active joints; (N, tips, 6, n) if there are several.
 
         Expressed in the base. Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for
-        slides].
+        prismatic joints].
         """
         q = self.joint_values(q)
         places, ends = self.places(q), self.tip_places

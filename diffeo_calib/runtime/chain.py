@@ -66,7 +66,7 @@ class Sag:
         joints: (K,) the moving joint of every coordinate.
         axes: (K, 3) its unit vector in the joint's frame.
         moments: (3 K, 3 F) W.
-        forces: (K, 3) w, constant forces on slides.
+        forces: (K, 3) w, constant forces on prismatic joints.
         directions: (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad].
     """
 
@@ -95,7 +95,7 @@ class CalibratedChain:
         ancestors: (F, n_all) whether joint l moves place f.
         motions: (4, n_all, 4, 4) C, S, D, L.
         axes: (n_all, 3) joint axes in their own frames.
-        revolute: (n_all,) False for slides.
+        revolute: (n_all,) False for prismatic joints.
         coupling: (n_all, n), coupling_offset: (n_all,): moving joints' values from the active ones'.
         sag: gravity sag; None without it.
         waves: of the active joints; None without.

@@ -55,6 +55,8 @@ def test_another_number_or_order_of_joints_is_refused(arm: Few) -> None:
         dc.calibrate(arm.robot, dc.Measurements(q[:, :5], points))
     with pytest.raises(RobotError, match="put the columns in the robot's order"):
         dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=arm.robot.joint_names[::-1]))
+    with pytest.raises(RobotError, match=r"got \S*q1.*joints=.*from_dh\(\.\.\., names="):
+        dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=[f"q{k}" for k in range(1, 7)]))
 
 
 @pytest.mark.parametrize("rows", [1, 2])

@@ -142,6 +142,10 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     text = page.read_text()
     assert text.count("<img") == 5
     assert "3 of 5 images" in text
+    (folder / "joints.csv").write_text((folder / "joints.csv").read_text().replace(",", ";"))
+    done = command(*words, "--sep", ";", "--decimal", ",")
+    assert done.code == 0, done.err
+    assert [line.replace(",", ".").replace(";", ",") for line in out.read_text().splitlines()] == lines
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_wrong_units(units: tuple[Any, ...], small_site: Site, command: Command,
         (["--base", "output_link"], r"no moving joint from 'output_link' to 'flange'"),
         (["--joints", "waist_joint,shoulder_joint"], r"expected 6 columns, in the order .*, got 2"),
         (["--joints", "a,b,c,d,e,f"], r"no column \['a', 'b', 'c', 'd', 'e', 'f'\]"),
-        (["--robot", "nowhere.urdf"], r"there is no file 'nowhere.urdf'; check the path of the URDF"),
+        (["--robot", "nowhere.urdf"], r"there is no file nowhere.urdf; check the path of --robot"),
     ],
 )
 def test_wrong_options(options: list[str], message: str, small_site: Site, command: Command, tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert "Errors of distances in mm by stage" in fitted.out
     assert "fixed point 'A': 1200." in " ".join(fitted.out.split()).replace("1199.", "1200.")
     assert "expected absolute error" in fitted.out
-    assert "errors of readings flatter" in fitted.out
+    assert "errors of readings are smaller than the true error" in fitted.out
     written = json.loads((folder / "m.json").read_text())
     jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
     found = written["results"]

@@ -109,11 +109,14 @@ def test_the_version_is_that_of_the_installation(command: Command) -> None:
     assert version("diffeo_calib") == dc.__version__
 
 
-def test_errors_before_the_work_load_no_torch(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("output", "message"), [("none/model", "there is no folder"), ("model", "no file t.csv; check")]
+)
+def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_path: Path) -> None:
     fit = ["fit", "t.csv", "--robot", "r.urdf", "--base", "a", "--tip", "b", "--position", "x,y,z"]
-    units = ["--length", "m", "--angle", "rad", "-o", str(tmp_path / "none" / "model")]
+    units = ["--length", "m", "--angle", "rad", "-o", str(tmp_path / output)]
     command = [sys.executable, "-c", LIGHT, *fit, *units]
     done = subprocess.run(command, capture_output=True, env=environment(), timeout=60, check=False, encoding="utf-8")
     assert done.returncode == 1
-    assert "there is no folder" in done.stderr
+    assert message in done.stderr
     assert "torch" not in done.stderr.splitlines()[-1]

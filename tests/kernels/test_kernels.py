@@ -41,6 +41,14 @@ def test_matrix_is_the_textbook_formula(case: Case) -> None:
 
 
 @every_case
+def test_momenta_that_are_not_those_of_the_points_are_refused(case: Case) -> None:
+    x, q, a = data(case)
+    for wrong in (a[:-1], a[:, :-1], a[0]):
+        with pytest.raises(InputError, match="the momenta `a`"):
+            case.kernel.field(x, q, wrong)
+
+
+@every_case
 def test_value_at_a_point_is_the_output_matrix(case: Case) -> None:
     x = case.points(1, seed=1)
     torch.testing.assert_close(case.kernel.matrix(x, x), case.at_zero(), rtol=1e-14, atol=1e-14)

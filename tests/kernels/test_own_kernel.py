@@ -27,6 +27,17 @@ class Skewed(Kernel):
         return torch.kron(kappa.contiguous(), A)
 
 
+def test_another_backend_than_the_dense_matrix_is_warned_about_once() -> None:
+    class Unwarned(Skewed):
+        pass
+
+    kernel = Unwarned(0.7, 0.3)
+    assert kernel.using("auto") is kernel.using("dense") is kernel
+    with pytest.warns(dc.DiffeoCalibWarning, match="Unwarned .* dense matrix; .* RadialKernel"):
+        kernel.using("fused")
+    kernel.using("tiled")  # warnings are errors
+
+
 class Plain(Kernel):
     """The package's Gaussian, defined by its matrix alone, to compare all defaults with the closed forms."""
 

@@ -80,6 +80,7 @@ def test_at_the_command_the_model_is_at_the_target(arm: Case, frame: str) -> Non
     assert all(float(part.max()) > 1e-4 for part in misses(arm, q, targets))  # something was to be done
     assert found.counts["reached"] == int(found.reached.sum()) == sum(s == "reached" for s in found.status)
     assert "reached" in repr(found)
+    assert repr(found.status[:1]) == "('reached',)"
 
 
 def test_positions_take_the_smallest_motion(arm: Case) -> None:

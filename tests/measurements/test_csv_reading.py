@@ -26,6 +26,24 @@ def test_reads_si(read: Reader) -> None:
     assert data.joint_names == ("q1", "q2")
 
 
+def test_columns_may_have_other_names_than_the_robot_s_joints(read: Reader, tmp_path: Path) -> None:
+    robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
+    expected = read(HEADER + "250,90,1000,0,500\n", kinds=robot.kinds, length="mm", angle="deg")
+    how: dict[str, Any] = {"length": "mm", "angle": "deg"}
+    data = read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS, **how)
+    assert data.joint_names == robot.joint_names
+    assert torch.equal(data.q, expected.q)
+    with pytest.raises(MeasurementError, match="`joints`"):
+        read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS[:1], **how)
+
+
+def test_columns_of_other_joints_are_not_suggested(tmp_path: Path) -> None:
+    joints = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+    (tmp_path / "table.csv").write_text("wrist_1_joint,wrist_2_joint,Wrist3,x,y,z\n1,2,3,4,5,6\n")
+    with pytest.raises(MeasurementError, match=r"for 'wrist_3_joint', did you mean Wrist3\.$"):
+        read_measurements(tmp_path / "table.csv", joints, POSITION, length="m", angle="rad")
+
+
 def test_converts_degrees_millimetres_and_decimal_commas(read: Reader) -> None:
     expected = read(HEADER + "0.5,1.5,1.2345,-2.0,0.25\n")
     text = f"q1;q2;x;y;z\n{math.degrees(0.5)!r};{math.degrees(1.5)!r};1234,5;-2,0e3;250\n".replace(".", ",")

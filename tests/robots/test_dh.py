@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffeo_calib.common.errors import RobotError
+from diffeo_calib.common.errors import DiffeoCalibWarning, RobotError
 from diffeo_calib.robots import Chain, DHRow, from_dh, load_urdf
 from diffeo_calib.robots.tree import robot_from_config
 
@@ -110,6 +110,8 @@ def test_ur10_table_and_urdf_are_one_robot() -> None:
         (([(0, 0, 0), DHRow(0, 0, 0, mimic={"joint_1": nan})],), "the multiplier of 'joint_1' in joint 'joint_2'"),
         (([(0, nan, 0)],), "row 0 of the DH table: expected finite numbers"),
         (([DHRow(0, 0, 0, beta=nan)],), "row 0 of the DH table: expected finite numbers"),
+        (([(0, 1, 0), (0, 90, 0)],), "an angle in row 1 of the DH table: expected rad, at most 2 pi, got 90"),
+        (([(0, 0, 0, -180)],), "an angle in row 0 of the DH table"),
         (([(0, "x", 0)],), "row 0 of the DH table: expected numbers"),
         (([(0, 0, 0, 0, "ball")],), "the kind in row 0 of the DH table"),
         (([DHRow(0, 0, 0, 0, "fixed")],), "the kind in row 0 of the DH table"),
@@ -120,6 +122,12 @@ def test_ur10_table_and_urdf_are_one_robot() -> None:
 def test_wrong_tables_are_explained(arguments: tuple, message: str) -> None:
     with pytest.raises(RobotError, match=re.escape(message)):
         from_dh(*arguments)
+
+
+@pytest.mark.parametrize("row", [(612, 0, 0), (0, 0, -128)])
+def test_millimetres_are_warned_about(row: tuple[float, float, float]) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="row 0 of the DH table is .* in mm"):
+        from_dh([row])
 
 
 BRANCHED = [

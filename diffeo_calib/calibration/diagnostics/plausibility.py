@@ -34,6 +34,7 @@ from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import joint_name_fix
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def _check_names(robot: Tree, data: Any) -> None:
             f"the measurements' joints are not those of robot '{robot.name}'",
             expected=few(robot.joint_names, MOST_NAMES),
             got=few(data.joint_names, MOST_NAMES),
-            fix="put the columns in the robot's order",
+            fix=joint_name_fix(robot, data.joint_names),
         )
 
 
@@ -316,7 +317,7 @@ def check_not_nominal(robot: Tree, data: TangentData, registration: Identificati
     predicted = points if data.observe is None else data.observe.value(points)
     errors = (data.y - predicted).masked_fill(~data.visible, torch.nan)
     rms = float(errors.square().nanmean().sqrt())
-    size = float((data.y - data.y.mean(0)).abs().amax())  # the reach of a robot with slides may have no bound
+    size = float((data.y - data.y.mean(0)).abs().amax())  # the reach of a robot with prismatic joints may have no bound
     spare = int(data.visible.sum()) > NOMINAL.overdetermined * _placed_numbers(data)
     if spare and (rms < NOMINAL.share * size or _by_digits(robot, data, errors)):
         expected = "errors of some 0.1 mm, which every robot has"

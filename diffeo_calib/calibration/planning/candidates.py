@@ -165,7 +165,8 @@ def candidates(
     Args:
         robot: the chain, n joints.
         count: number of configurations.
-        ranges: name of a joint -> (lower, upper), rad or m, instead of its limits; slides without limits need one.
+        ranges: name of a joint -> (lower, upper), rad or m, instead of its limits; prismatic joints without
+            limits need one.
         keep: takes configurations (N, n), rad or m, and returns (N,) booleans, False for those that cannot be measured:
             outside the cell, in collision. See :func:`diffeo_calib.calibration.planning.candidates.collision_free`.
         tracker: the device that has to see the tool.
@@ -269,7 +270,7 @@ def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, f
     if not turns:
         if not (isfinite(lower) and isfinite(upper)):
             fix = f"pass ranges={{'{name}': (lower, upper)}} in m"
-            raise InputError.of(f"joint '{name}' slides without limits", fix=fix)
+            raise InputError.of(f"the prismatic joint '{name}' has no limits", fix=fix)
         return lower, upper
     if upper - lower <= TURN:
         return lower, upper
@@ -376,7 +377,7 @@ def collision_free(
 
 
 def _unlimited(robot: Tree) -> dict[str, tuple[float, float]]:
-    """Any range for slides without limits."""
+    """Any range for prismatic joints without limits."""
     ends = zip(robot.joint_names, robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
     return {name: (0.0, 1.0) for name, turns, limited in ends if not (turns or limited)}
 

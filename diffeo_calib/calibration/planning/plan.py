@@ -169,7 +169,7 @@ class Plan:
 
         Args:
             path: the file.
-            length: unit of slides, ``"m"`` or ``"mm"``. angle: unit of turning joints, ``"rad"`` or ``"deg"``.
+            length: unit of prismatic joints, ``"m"`` or ``"mm"``. angle: of revolute joints, ``"rad"`` or ``"deg"``.
             sep: one character between cells. decimal: ``"."`` or ``","``.
 
         Raises:

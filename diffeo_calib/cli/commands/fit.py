@@ -180,7 +180,7 @@ def _write_pictures(
     if outputs.report is not None:
         with progress_bar() as progress:
             own, placed = _report_stages(result)
-            write_report(result.model, outputs.report, data, title=name, stages=own, places=placed, progress=progress)
+            write_report(result.model, outputs.report, data, stages=own, places=placed, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
 

@@ -5,43 +5,35 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
-from typing import NamedTuple
 
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import read_folder
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.options import BoardImages
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
 from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.table_format import TableFormat
 
 
-class Wanted(NamedTuple):
-    """The board as a text, unit of places on it, standard deviation of its size as a share, separator."""
-
-    board: str
-    length: str
-    board_std: float
-    sep: str
-
-
-def run(folder: Path, joints: Path, wanted: Wanted, output: Path, overview: Path | None) -> None:
+def run(folder: Path, joints: Path, given: BoardImages, output: Path) -> None:
     """Find the board, and write corners, camera and overview."""
-    found = read_folder(folder, joints, Board.of(wanted.board), wanted.sep)
+    table = TableFormat(given.length.value, "rad", given.sep, given.decimal)
+    found = read_folder(folder, joints, Board.of(given.board), table.sep)
     for one in found.images:
         if one.refused:
             say(f"{one.name}: {one.refused}: left out")
     text, camera = io.StringIO(newline=""), output.with_suffix(".yaml")
-    sheet = csv.writer(text, delimiter=wanted.sep)
+    sheet = csv.writer(text, delimiter=table.sep)
     sheet.writerow([IMAGE, *found.header, *POINT, *PIXEL])
-    sheet.writerows(found.rows(UNITS_PER_METRE[wanted.length]))
+    sheet.writerows(found.rows(table.per_metre, table.decimal))
     contents = {output: text.getvalue().encode()}
-    contents[camera] = camera_text(found.camera(BoardPrior(scale=wanted.board_std))).encode()
-    if overview is not None:
-        contents[overview] = found.page().encode()
+    contents[camera] = camera_text(found.camera(BoardPrior(scale=given.board_std))).encode()
+    if given.overview is not None:
+        contents[given.overview] = found.page().encode()
     write_together(contents)
     corners = sum(len(one.numbers) for one in found.used)
     width, height = found.size

@@ -1,11 +1,12 @@
 """Dispatch of kernel sums: choose a backend and evaluate a formula on it.
 
-dense   one materialised (M, N) matrix
-fused   one loop compiled for the processor (llvmlite); fastest on a CPU; memory O(M + N)
-tiled   matrices on tiles that fit the cache, in plain torch; memory O(M + N)
-keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
-distributed   tiles shared by the processes of one program (torchrun)
-auto    one of the first four, by the number of pairs, the device and what is installed
+name         how it sums                                            memory     when
+dense        one matrix of all pairs                                O(M N)     few points
+fused        one loop compiled for the processor (extra `fused`)    O(M + N)   fastest on a CPU
+tiled        matrices on tiles that fit the cache, in plain torch   O(M + N)   works everywhere
+keops        LazyTensors, compiled by KeOps (extra `keops`)         O(M + N)   fastest on a GPU, for many points
+distributed  tiles shared by the processes of one torchrun program  O(M + N)   several processes
+auto         dense, fused, tiled or keops, by the number of pairs, the device and what is installed
 
 With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
 (single.py), whatever the backend.

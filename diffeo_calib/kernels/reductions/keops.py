@@ -1,4 +1,4 @@
-"""Sums as KeOps LazyTensors: one fused, compiled loop per formula, the fastest backend for many points.
+"""Sums as KeOps LazyTensors: one fused, compiled loop per formula, see the table in backends.py.
 
 pykeops is imported on first use. Each formula is compiled once per machine (about 5 s) with its C++
 compiler and kept in a separate cache folder.

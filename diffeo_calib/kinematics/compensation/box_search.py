@@ -272,7 +272,7 @@ def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
 
 
 def rates(chain: Tree, rate: object, usual: Array) -> Array:
-    """(n,) how fast a correction may change; ``usual`` (n,) is taken for slides if one number is given.
+    """(n,) how fast a correction may change; ``usual`` (n,) is taken for prismatic joints if one number is given.
 
     Raises:
         InputError: not a positive number, or one for each joint.

@@ -141,7 +141,7 @@ def compensate(
             targets of all tips (T, 4, 4) or (T, 3).
         frame: frame of the targets, "base" or "measuring".
         bound: largest motion of a joint away from its start: one number in rad for all turning joints, or one for each
-            joint in rad or m. Default 1 degree, 0.02 m for slides; ten times that where rows start at the row before.
+            joint in rad or m. Default 1 degree, 0.02 m if prismatic; ten times that where rows start at the row before.
         limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
             limit is brought back if the bound allows it.
         weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2,

@@ -211,6 +211,9 @@ class Status(str, Enum):
     def __str__(self) -> str:
         return self.value
 
+    def __repr__(self) -> str:
+        return repr(self.value)
+
 
 MEMBERS = tuple(Status)
 CODE = {status: code for code, status in enumerate(MEMBERS)}

@@ -392,7 +392,7 @@ def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str
         raise MeasurementError.of(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
     if missing:
         what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
-        raise MeasurementError.of(what, got=got, fix=_near(missing, header))
+        raise MeasurementError.of(what, got=got, fix=_near(missing, [name for name in header if name not in wanted]))
     return [header.index(name) for name in wanted]
 
 
@@ -405,19 +405,26 @@ def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
     return MeasurementError.of(f"file '{path}', header", expected=f"columns separated by {sep!r}", got=got, fix=fix)
 
 
-def _near(missing: Sequence[str], header: Sequence[str]) -> str:
-    lowered = {name.lower(): name for name in header if len(name) <= LONGEST_NAME}
+def _near(missing: Sequence[str], free: Sequence[str]) -> str:
+    """Which of the columns that no other name matches may be meant; "_", "joint" and case do not count."""
+    names = {_bare(name): name for name in free if len(name) <= LONGEST_NAME}
     near = {
-        name: difflib.get_close_matches(name.lower(), lowered, n=2)
+        name: difflib.get_close_matches(_bare(name), names, n=2)
         for name in missing[:MOST_NAMES]
         if len(name) <= LONGEST_NAME
     }
     hints = [
-        f"for '{shown(name)}', did you mean {' or '.join(shown(lowered[m]) for m in found)}"
+        f"for '{shown(name)}', did you mean {' or '.join(shown(names[m]) for m in found)}"
         for name, found in near.items()
         if found
     ]
     return "; ".join(hints) if hints else "pass the names as written in the header"
+
+
+def _bare(name: str) -> str:
+    """A name as it is compared with others."""
+    lowered = name.lower()
+    return lowered.replace("joint", "").replace("_", "") or lowered
 
 
 def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:

@@ -97,8 +97,8 @@ class Columns:
         """Check names and kinds of columns.
 
         Raises:
-            MeasurementError: not names, another number of kinds than names or unknown ones, a unit of slides without
-                kinds, other numbers of positions and rotations, or a column named twice.
+            MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
+                without kinds, other numbers of positions and rotations, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(joints, kinds)
         if table.joint_length is not None and not kinds_known:

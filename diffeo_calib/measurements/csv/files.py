@@ -112,7 +112,8 @@ def _check_options(columns: TableColumns, table: TableFormat) -> None:
     if columns.position is not None:
         return
     given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
-    given |= {"camera_on_tool": table.camera_on_tool or None, "session": columns.session}
+    given |= {"camera_on_tool": table.camera_on_tool or None, "remounted": table.remounted or None}
+    given |= {"session": columns.session}
     names = [f"`{name}`" for name, value in given.items() if value is not None]
     if names:
         beside = "socket" if columns.sockets is not None else "readings"
@@ -153,9 +154,10 @@ PLAIN = (1.0, 1.0, 0.0, 0.0)
 @outside_inference_mode
 def read_measurements(
     path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
+    robot: Sequence[str] | ChainLike,
     position: Names | None = None,
     *,
+    joints: Sequence[str] | None = None,
     length: str,
     angle: str,
     sep: str = ",",
@@ -175,6 +177,7 @@ def read_measurements(
     on: Sequence[str] | None = None,
     camera_on_tool: bool = False,
     session: str | None = None,
+    remounted: bool = False,
     socket: Sequence[str] | str | None = None,
     distances: Distances | None = None,
     distance_std: float | None = None,
@@ -186,7 +189,8 @@ def read_measurements(
 
     Args:
         path: the file.
-        joints: names of the joint columns in the robot's order, or the robot (``joint_names``, ``kinds``).
+        robot: whose joints name the columns (``joint_names``, ``kinds``); or these names without a robot, in its order.
+        joints: names of the columns in the robot's order, where they are not those of its joints.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
             sockets. With ``socket`` every line has a position or a socket, and empty cells for the other; a line with
             both is two rows.
@@ -213,6 +217,7 @@ def read_measurements(
             For another link see :meth:`Measurements.with_payload`.
         time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
+        remounted: whether the markers were mounted anew between these instead, see there.
         camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
             deviations are along its axes; see :meth:`Measurements.from_poses`.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
@@ -234,14 +239,29 @@ def read_measurements(
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
-    table = replace(table, camera_on_tool=camera_on_tool, time=time, temperature=temperature)
+    table = replace(table, camera_on_tool=camera_on_tool, remounted=remounted, time=time, temperature=temperature)
     if socket is None and (distances is not None or distance_std is not None):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     tip = None if not on or isinstance(on, str) else on[-1]
     names = (socket,) if isinstance(socket, str) else tuple(socket or ())
     sockets = None if socket is None else SocketColumns(names, distances, distance_std, tip)
-    columns = TableColumns(joints, position, sockets, session=session, kinds=kinds, on=on)
-    return read_observations(path, columns, table, duplicates=duplicates)
+    columns = TableColumns(robot, position, sockets, session=session, kinds=kinds, on=on)
+    return _read(path, columns, table, duplicates, joints)
+
+
+def _read(
+    path: str | PathLike[str], columns: TableColumns, table: TableFormat, duplicates: str, joints: Sequence[str] | None
+) -> Any:
+    """Read columns, whose joints may have other names in the file than in the robot."""
+    robot = columns.joints
+    if joints is None:
+        return read_observations(path, columns, table, duplicates=duplicates)
+    names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
+    if len(names) != len(joints):
+        got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
+        raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
+    columns = replace(columns, joints=joints, kinds=columns.kinds or kinds)
+    return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
 
 
 def read_table(
@@ -262,10 +282,11 @@ def read_table(
 @outside_inference_mode
 def read_readings(
     path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
+    robot: Sequence[str] | ChainLike,
     values: Sequence[str] | str | float,
     kind: str = "distance",
     *,
+    joints: Sequence[str] | None = None,
     length: str,
     angle: str,
     sep: str = ",",
@@ -283,7 +304,7 @@ def read_readings(
     """Read a table of distances, heights or places in images from a CSV file (UTF-8, one header line), in SI.
 
     Args:
-        path, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.
+        path, robot, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.
         values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
         kind: "distance", "height" or "image".
         length: unit of the readings in the file, ``"m"`` or ``"mm"``; images are in pixels.
@@ -316,8 +337,7 @@ def read_readings(
     known = () if given is None else column_names("std", given, "names of columns", several)
     of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or PLAIN, known, on)
     table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
-    columns = TableColumns(joints, readings=(of_kind,), kinds=kinds)
-    return read_observations(path, columns, table, duplicates=duplicates)
+    return _read(path, TableColumns(robot, readings=(of_kind,), kinds=kinds), table, duplicates, joints)
 
 
 def read_joints(

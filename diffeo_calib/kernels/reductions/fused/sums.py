@@ -1,4 +1,4 @@
-"""Kernel sums in one compiled loop that stores nothing per pair: the fastest backend on a CPU.
+"""Kernel sums in one compiled loop that stores nothing per pair; see the table in backends.py.
 
 Formulas and profiles are those of all backends, compiled for this processor by LLVM at first use: 0.1 s for each
 formula, profile and number of coordinates, once per machine, since the code is kept on disk. Needs the package
