@@ -102,8 +102,6 @@ def check_place(rows: Rows) -> None:
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    if rows.remounted and rows.session is None:
-        raise InputError.of("--remounted without --session", fix="name the column of the set-ups too")
     if rows.socket is None and (rows.distance or rows.distance_std is not None):
         raise InputError.of("--distance without --socket", fix="name the columns of the sockets too")
     if rows.distance and rows.distance_std is None:

@@ -24,7 +24,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.places import MOUNTING, PlacedDevices
+from diffeo_calib.sensors.places import MOUNTING, PlacedDevices, seen_mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +145,7 @@ def _mounted(model: Any, own: PlacedDevices, q: Tensor, *, noise: bool) -> Itera
     for name, shift, std in zip(own.names, shifts, deviations, strict=True):
         if bool(shift.any()):
             places = 1e3 * (mean[:, :P] + (turns @ shift[..., None])[..., 0])
+            places = places.masked_fill(~seen_mounted(std)[:, None], torch.nan)
             blocks = 1e6 * (covariance[:, :P] + turns @ torch.diag_embed(std.square()) @ turns.mT)
             yield PredictedReadings("position", name, "mm", places.flatten(1), block_diagonal(blocks))
 

@@ -19,7 +19,7 @@ from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera
 from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
 from diffeo_calib.sensors.kinds import kind_of, known_kinds
@@ -159,17 +159,24 @@ def _middle(away: Tensor) -> tuple[Tensor, Tensor]:
     kept = torch.where((size <= GROSS_DISTANCES * size.nanmedian(0).values)[..., None], away, torch.nan)
     count = (~kept.isnan()).sum(0).clamp(min=1)
     mean = kept.nanmean(0).nan_to_num(0.0)
-    return mean, (kept - mean).square().nanmean(0).nan_to_num(0.0).sqrt() / count.sqrt()
+    return mean, ((kept - mean).square().nanmean(0).sqrt() / count.sqrt()).nan_to_num(PLACES.remounted_m)
+
+
+def seen_mounted(deviations: Tensor) -> Tensor:
+    """(..., P) boolean: markers that rows of their session showed, by the deviations (..., P, 3) of their places, m."""
+    return deviations.amax(-1) < 0.5 * PLACES.remounted_m
 
 
 def mounted_sentences(names: Sequence[str], shifts: Tensor, deviations: Tensor) -> list[str]:
     """How far the markers (S, P, 3) of every session are from those of the model, m; none for the model's own."""
     lines = []
     for name, shift, std in zip(names, shifts, deviations, strict=True):
-        sizes = ", ".join(f"{1e3 * float(own.norm()):.3f}" for own in shift)
+        sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
+        seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
+        known = ", ".join(f"{size:.3f} +- {own:.3f} mm" if shown else "not seen" for (size, own), shown in seen)
         if bool(shift.any()):
-            away = f"{sizes} +- {1e3 * float(std.square().mean().sqrt()):.3f} mm away from that of the model"
-            lines.append(f"session '{name}': its marker{'s are' if len(shift) > 1 else ' is'} {away}")
+            markers = "markers are" if len(shift) > 1 else "marker is"
+            lines.append(f"session '{name}': its {markers} {known} away from that of the model")
     return lines
 
 

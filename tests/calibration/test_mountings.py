@@ -12,6 +12,8 @@ from product_bank import usual_scales
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, twist_transform
 
@@ -88,6 +90,21 @@ def test_the_marker_of_each_session_is_predicted(result: dc.CalibrationResult) -
         assert float((squares < 7.81).double().mean()) > 0.9
 
 
+def test_a_marker_that_a_session_hides() -> None:
+    """It is where it was, and nothing is predicted of it there."""
+    arm = SimulatedArm(seed=1, markers=2)
+    rows = remounted(arm, dc.Measurements(*arm.measure(90, seed=1), arm.nominal.joint_names), SHIFTS)
+    points, names = rows.points.clone(), rows.device_names
+    points[[name == "c" for name in names], 1] = torch.nan
+    data = dc.Measurements(rows.q, points, arm.nominal.joint_names).with_sessions(names, remounted=True)
+    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal))
+    assert [text.partition(" away")[0].count("not seen") for text in found.placement.sentences()] == [0, 1]
+    (b, c) = found.model.predict_readings(rows.q[:3])
+    assert bool(b.mean.isfinite().all())
+    assert c.mean.isnan().view(3, 2, 3).any(2).any(0).tolist() == [False, True]
+    assert dc.evaluate(found.model, data).rms < 1e-4
+
+
 def test_a_year_later(result: dc.CalibrationResult) -> None:
     """The device stands elsewhere, and the marker was mounted anew twice more."""
     T = twist_transform(torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64))
@@ -122,6 +139,16 @@ def test_nothing_is_said_where_frames_moved(recwarn: pytest.WarningsRecorder) ->
     both = torch.where(first[:, None, None], torch.eye(4, dtype=torch.float64), T)
     calibrated(rows.in_frames(both).with_sessions(["ab"[int(k >= 35)] for k in range(60)]))
     assert not [one for one in recwarn if "--remounted" in str(one.message)]
+
+
+def test_set_ups_are_named(tmp_path: Path) -> None:
+    path, columns = tmp_path / "t.csv", ["x", "y", "z"]
+    write_measurements(path, remounted(ARM, table(10, 1)), TableFormat("m", "rad"))
+    known: dict[str, Any] = {"length": "m", "angle": "rad"}
+    with pytest.raises(MeasurementError, match="`remounted` without `session`"):
+        dc.read_measurements(path, ARM.nominal, columns, remounted=True, **known)
+    same = dc.read_measurements(path, ARM.nominal, columns, remounted=True, session="session", **known)
+    assert (same.remounted, same.session_names) == (True, ("a", "b", "c"))
 
 
 def test_poses_are_refused() -> None:

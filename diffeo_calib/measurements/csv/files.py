@@ -109,6 +109,8 @@ def _check_options(columns: TableColumns, table: TableFormat) -> None:
     if not columns.sensors:
         fix = "name the columns of the marker, or those of `socket`"
         raise MeasurementError.of("`position` is missing", fix=fix)
+    if table.remounted and columns.session is None:
+        raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
     if columns.position is not None:
         return
     given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
