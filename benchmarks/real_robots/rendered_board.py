@@ -22,6 +22,8 @@ TEXELS, MARGIN = 60, 40
 """Texture: pixels of a square, and white around the board."""
 FINER = 2
 """Samples of a pixel along each side."""
+BACKGROUND, COARSE = 110, 8
+"""Grey value; samples between those that look for the page."""
 
 
 FACING = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
@@ -52,6 +54,27 @@ def rendered(
         noise: standard deviation of grey values, of 255. seed: of the noise. camera: with the print; the usual lens.
     """
     camera, rays = camera or true_camera(), _rays()
+    found = _on_page(rays[::COARSE, ::COARSE], pose, page, camera)
+    inside = ((found > -1) & (found < found.new_tensor([page.shape[1], page.shape[0]]))).all(-1)
+    # the part of the image that shows the page, whose corners may lie between the samples; all else is background
+    box = tuple(
+        slice(COARSE * max(0, int(some.min()) - 3), COARSE * (int(some.max()) + 4))
+        for some in (inside.any(1 - axis).nonzero() for axis in range(2))
+        if len(some)
+    )
+    shown = np.full((FINER * HEIGHT, FINER * WIDTH), BACKGROUND, dtype=np.uint8)
+    if box:
+        at = _on_page(rays[box], pose, page, camera).numpy()
+        own = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": BACKGROUND}
+        shown[box] = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, **own)
+    grey = cv2.resize(shown.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    grey = cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px else grey
+    grey = 20 + 0.8 * grey + noise * np.random.default_rng(seed).standard_normal(grey.shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def _on_page(rays: Tensor, pose: Tensor, page: np.ndarray, camera: Camera) -> Tensor:
+    """Where rays (..., 3) meet the page, (..., 2) in its pixels; far away behind the camera."""
     # from the plane of the board as it was meant to that of the image: bends and scales are small, two rounds do
     R, t = pose[:3, :3].float(), pose[:3, 3].float()
     flat = torch.zeros_like(rays)
@@ -62,13 +85,8 @@ def rendered(
         flat[..., 2] = 0.0
         real = real_board(flat, camera.board.float(), camera.half_size)
         lift, flat = real[..., 2], flat + (flat - real) * flat.new_tensor([1.0, 1.0, 0.0])
-    at = (flat[..., :2] / SQUARE * TEXELS + torch.tensor([page.shape[1] / 2, page.shape[0] / 2]) - 0.5).float().numpy()
-    at[depth.numpy() <= 0] = -1e6
-    grey = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
-    grey = cv2.resize(grey.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
-    grey = cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px else grey
-    grey = 20 + 0.8 * grey + noise * np.random.default_rng(seed).standard_normal(grey.shape)
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    at = flat[..., :2] / SQUARE * TEXELS + flat.new_tensor([page.shape[1] / 2, page.shape[0] / 2]) - 0.5
+    return at.masked_fill((depth <= 0)[..., None], -1e6)
 
 
 @cache

@@ -213,7 +213,8 @@ def by_readings(name: str, noise: float, seed: int, count: int) -> Iterator[Reco
     for method, stage in (("nominal", "nominal + registration"), ("geometry", "geometry")):
         yield record | {"method": method} | judged(arm, seed, result.stages[stage])
     fresh, there, values = rows_of(arm, case, HELD_OUT, seed + 200)
-    held_out = result.reading_errors(case.readings(fresh, values, there))[1]
+    (devices,), rows = result.places().devices.values(), case.readings(fresh, values, there)
+    held_out = devices.errors(rows, devices.points_of(result.model(rows.q).detach()))
     own: Record = {"held_out_mm": 1e3 * float(held_out.square().sum(1).mean().sqrt())}
     own["size_std"] = 1e3 * result.expected.size
     yield record | {"method": "full"} | judged(arm, seed, result.model) | own

@@ -439,13 +439,14 @@ def clean(seed: int) -> tuple[str, SimulatedArm, Campaign]:
 
 def measure(arguments: argparse.Namespace) -> Iterator[Record]:
     """Yield the records."""
-    for seed in range(arguments.clean or 0):
+    first = arguments.first
+    for seed in range(first, first + (arguments.clean or 0)):
         how, arm, campaign = clean(seed)
         yield {"mistake": f"none, {how}", "arm": seed} | judged(arm, campaign)
     if arguments.clean:
         return
     for name in arguments.mistakes or MISTAKES:
-        for seed in range(1 if arguments.quick else arguments.arms):
+        for seed in range(first, first + (1 if arguments.quick else arguments.arms)):
             arm, rng = SimulatedArm(seed), np.random.default_rng([seed, 11])
             yield {"mistake": name, "arm": seed} | judged(arm, MISTAKES[name](arm, rng))
 
@@ -455,6 +456,7 @@ def main() -> None:
     parser = harness.parser(__doc__)
     parser.add_argument("--arms", type=harness.count, default=5, metavar="N")
     parser.add_argument("--clean", type=harness.count, metavar="N", help="measure clean campaigns instead")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first arm or campaign")
     parser.add_argument("--mistakes", nargs="+", metavar="NAME", choices=list(MISTAKES), help="which; all by default")
     arguments = parser.parse_args()
 

@@ -244,7 +244,8 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
-    warn_of_contradictions(model, placed.coordinates, found, _change(placed, chosen))
+    changed = placed.mislabelled(model, found) or _change(placed, chosen)
+    warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
     rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(

@@ -16,19 +16,16 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.placing.place import Placed
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.placing.readings import ReadingDevices
-from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.data_frames import table_html
-from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import with_positions
@@ -96,9 +93,9 @@ class CalibrationResult:
         return self.placed.placement
 
     @property
-    def sessions(self) -> SessionFrames | None:
-        """Measuring frames of the sessions, if the measurements name several."""
-        return self.placement.one(SessionFrames)
+    def sessions(self) -> Any:
+        """Measuring frames, or markers, of the sessions, if the measurements name several; None otherwise."""
+        return self.placement.one(Sessions)
 
     @property
     def sockets(self) -> SocketDevices | None:
@@ -131,23 +128,6 @@ class CalibrationResult:
         devices = self.placed.devices_by_stage[STAGES.index(stage)]
         by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
         return Places(self.placement, by_key, self.placed.ball)
-
-    def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
-        """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.
-
-        Readings of other kinds than lengths are in m at the mean distance of the ball.
-
-        Raises:
-            InputError: an unknown stage.
-            MeasurementError: readings of another kind or of other devices.
-        """
-        if stage not in STAGES:
-            raise InputError.of("`stage`", expected=", ".join(STAGES), got=stage)
-        devices = self.places(stage).devices.get(sensor_key(data))
-        if devices is None:
-            fix = "pass rows of the devices of the calibration"
-            raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-        return devices, devices.errors(data, devices.points_of(self.stages[stage](data.q).detach()))
 
     @property
     def left_out(self) -> Evaluations:

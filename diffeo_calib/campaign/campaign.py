@@ -174,10 +174,7 @@ class Campaign:
         if self._model is None:
             self.verdicts.append(Verdict(row, None, accepted=True))
         else:
-            try:
-                self._model.judge(self.table, self.verdicts)
-            except DiffeoCalibError as error:  # a device that has no place yet
-                self.verdicts.append(Verdict(row, None, accepted=True, cause=str(error)))
+            self._judge(self._model, self.table)
         self._renew()
         self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
 
@@ -223,14 +220,36 @@ class Campaign:
 
     @small_work()
     def poll(self) -> bool:
-        """Put a model that was made in the background in the place of the old one; whether there was one."""
+        """Put a model that was made in the background in the place of the old one; whether there was one.
+
+        Rows that came before there was a model are judged by it.
+        """
         if self._maker is not None and not self._maker.is_alive():
             self._maker = None
         if self._made:
-            made = self._made.pop()
-            self._model = made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
+            self._model = self._caught_up(self._made.pop())
+            self._renew()
             return True
         return False
+
+    def _caught_up(self, made: CampaignModel) -> CampaignModel:
+        """A new model with the rows that came since its last one: those that no model has judged are judged by it."""
+        late = next((one.row for one in self.verdicts[made.seen :] if one.fits is None), None)
+        if late is not None:
+            made = made.rebuilt(self.table.rows(slice(0, late)), self.verdicts[:late])
+            before, self.verdicts = self.verdicts, self.verdicts[:late]
+            for old in before[late:]:
+                self._judge(made, self.table.rows(slice(0, old.row + 1)))
+                own = {"accepted": old.accepted, "decided": True} if old.decided else {}
+                self.verdicts[old.row] = replace(self.verdicts[old.row], expected_error=old.expected_error, **own)
+        return made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
+
+    def _judge(self, model: CampaignModel, table: Any) -> None:
+        """Add the verdict about the last row of a table."""
+        try:
+            model.judge(table, self.verdicts)
+        except DiffeoCalibError as error:  # a device that has no place yet
+            self.verdicts.append(Verdict(len(table) - 1, None, accepted=True, cause=str(error)))
 
 
 def _positions(q: object, y: object) -> Measurements:

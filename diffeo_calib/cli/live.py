@@ -112,6 +112,15 @@ class Live:
             if self.reached():
                 return
 
+    def poll(self) -> bool:
+        """Say what a model that was made in the background changes; whether there was one."""
+        if not self.campaign.poll():
+            return False
+        self.journal.add(self._revised())
+        changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
+        self._say(({"text": changed} if changed else {}) | self.state())
+        return True
+
     def take(self, sent: Sent) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
         entry = {} if isinstance(sent.entry, DiffeoCalibError) else sent.entry
@@ -124,7 +133,7 @@ class Live:
             elif entry:
                 number = self.ids.get(str(entry.get(ID)))
                 told = self.answer(self._append(entry) if number is None else number) | told
-            self.campaign.poll()
+            self.poll()
             told |= self.state()
         except InputError as error:
             told["error"] = str(error)
@@ -146,7 +155,7 @@ class Live:
         """
         self.judge(self.new_lines())
         header, line = self.table.written(row)
-        self._read([line], header)
+        self._read([line], header, len(self.lines))
         self.table.append(header, line)
         *others, own = self.new_lines()
         self.judge(others)
@@ -157,7 +166,7 @@ class Live:
         number = len(self.lines)
         entry: Entry = {"line": number + 2, "sha": digest(line)}
         try:
-            verdicts = self.campaign.add(self._read([line]))
+            verdicts = self.campaign.add(self._read([line], first=number))
             entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in verdicts]
             self.owner += [number] * len(verdicts)
         except DiffeoCalibError as error:
@@ -237,12 +246,15 @@ class Live:
         """The lines of some rows."""
         return [self.lines[number] for number in dict.fromkeys(self.owner[row] for row in rows)]
 
-    def _read(self, lines: Sequence[bytes], header: bytes = b"") -> Any:
-        """Lines as a table, in their order."""
+    def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
+        """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / self.source.csv.name
-            path.write_bytes((header or self.table.header) + b"".join(lines))
-            data = replace(self.source, csv=path).read(self.campaign.robot, self.tips)
+            path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
+            try:
+                data = replace(self.source, csv=path).read(self.campaign.robot, self.tips)
+            except DiffeoCalibError as error:
+                raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
         return data.rows(data.lines.argsort(stable=True))
 
 

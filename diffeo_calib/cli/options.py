@@ -203,6 +203,7 @@ class Rows:
         "KIND=COLUMN",
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
+    remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
     payload: PayloadColumn = None
     time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
     temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")

@@ -100,7 +100,9 @@ class RowColumns:
             why += "; width and height of the images are the least usual size that holds all corners" * self.of_boards
             yield "reading", self.readings[0] if len(self.readings) == 1 else self.readings, why
         if self.session is not None:
-            yield "session", self.session, "by its name: the device, or its set-up, of every row"
+            why = "by its name: the device, or its set-up, of every row"
+            why += "; add `remounted = true` if it stayed and the markers were mounted anew" * bool(self.markers)
+            yield "session", self.session, why
         if self.payload is not None:
             yield "payload", self.payload, "by its name: the known mass that the robot carried"
 

@@ -63,6 +63,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
+        remounted=rows.remounted,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
         payload=rows.payload,
@@ -148,7 +149,7 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     if all(there.values()) or not any(there.values()):
         return rows, []
     missing = [kind for kind, has in there.items() if not has]
-    changes: dict[str, Any] = {} if rows.session in header else {"session": None}
+    changes: dict[str, Any] = {} if rows.session in header else {"session": None, "remounted": False}
     if "--position" in missing:
         changes |= {"position": None, "std": None, "rotation": None, "rotation_std": None}
     if "--socket" in missing:

@@ -116,6 +116,13 @@ def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
     return tensor
 
 
+def check_covariance(matrix: Tensor, what: str) -> None:
+    """Raise InputError unless a matrix (m, m) is a covariance, m^2."""
+    skewed = bool(((matrix - matrix.mT).abs() > 1e-9 * matrix.abs().max()).any())
+    if skewed or int(torch.linalg.cholesky_ex(matrix).info):
+        raise InputError.of(what, expected="a symmetric positive definite matrix in m^2")
+
+
 def check_count(value: object, what: str, *, least: int = 1, most: int | None = None) -> None:
     """Raise InputError unless ``value`` is an integer in range."""
     good = isinstance(value, int) and not isinstance(value, bool) and value >= least
@@ -153,14 +160,14 @@ def index_of(value: object) -> int | None:
     return int(value) if isinstance(value, (int, np.integer)) and not isinstance(value, bool) else None
 
 
-def check_seed(seed: object, what: str = "`seed`") -> int:
+def check_seed(seed: object) -> int:
     """A seed of random numbers.
 
     Raises:
         InputError: not an integer from 0 to 2^63 - 1.
     """
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= LARGEST_SEED:
-        raise InputError.of(what, expected=f"an integer from 0 to {LARGEST_SEED}", got=as_written(seed))
+        raise InputError.of("`seed`", expected=f"an integer from 0 to {LARGEST_SEED}", got=as_written(seed))
     return int(seed)
 
 

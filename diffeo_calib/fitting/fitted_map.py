@@ -197,13 +197,18 @@ class FittedMap:
             rows, geodesic = x[some], self.geodesic.at_rows(some)
             mean, at = geodesic.linearised_value(rows)
             wanted = None if directions is None else directions(mean)
-            sensitivity = self.open_sensitivity(geodesic.spec.nominal, rows)
-            covariance = self.with_open_directions(self.covariance_at(at, wanted), sensitivity, wanted)
-            if noise:
-                covariance += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
             means.append(mean)
-            blocks.append(covariance)
+            blocks.append(self._covariance(geodesic, rows, at, wanted))
+            if noise:
+                blocks[-1] += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
         return torch.cat(means), torch.cat(blocks)
+
+    def _covariance(
+        self, geodesic: GeodesicDeformation, rows: Tensor, at: Linearisation, directions: Tensor | None
+    ) -> Tensor:
+        """Covariance of the map itself at some rows, with what is open, see :meth:`posterior`."""
+        sensitivity = self.open_sensitivity(geodesic.spec.nominal, rows)
+        return self.with_open_directions(self.covariance_at(at, directions), sensitivity, directions)
 
     def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Posterior covariance of the points of a linearisation, those of k1 or others of the body: (M, m', m').

@@ -15,7 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive, real_tensor
+from diffeo_calib.common.checks import as_tensor, check_count, check_covariance, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError
@@ -121,9 +121,7 @@ class Problem(Objective[GeodesicDeformation]):
             eye = torch.eye(m, dtype=self.y.dtype, device=self.y.device)
             return None if self.observe is None else NEGLIGIBLE_VARIANCE * eye
         checked = as_tensor(covariance, "new_noise", (m, m), fix="pass the covariance of one measurement, m^2").detach()
-        skewed = bool(((checked - checked.mT).abs() > 1e-9 * checked.abs().max()).any())
-        if skewed or int(torch.linalg.cholesky_ex(checked).info):
-            raise InputError.of("`new_noise`", expected="a symmetric positive definite matrix in m^2")
+        check_covariance(checked, "`new_noise`")
         return checked.to(self.y.device)
 
     def using(self, backend: Backend, accuracy: float | None = None) -> Problem:

@@ -22,7 +22,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text
+from diffeo_calib.interop.files import check_units, in_unit, origin_numbers, table_text
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import checked_tip
@@ -139,10 +139,10 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
 
     def fixed(name: str, transform: Tensor) -> list[object]:
         xyz, rpy = origin_numbers(transform)
-        return [name, "fixed", *[""] * 5, *lengths(xyz, length), *angles(rpy, angle), *[""] * (2 * mimics)]
+        return [name, "fixed", *[""] * 5, *in_unit(xyz, length), *in_unit(rpy, angle), *[""] * (2 * mimics)]
 
     def joint(name: str, row: DHRow) -> list[object]:
-        (a, d), (alpha, theta, beta) = lengths((row.a, row.d), length), angles((row.alpha, row.theta, row.beta), angle)
+        (a, d), (alpha, theta, beta) = in_unit((row.a, row.d), length), in_unit((row.alpha, row.theta, row.beta), angle)
         driven = " + ".join(f"{slope!r} {by}" for by, slope in (row.mimic or {}).items())
         follows = [driven, row.mimic_offset if driven else ""] if mimics else []
         return [name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows]

@@ -12,8 +12,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
-PER_METRE = {"m": 1.0, "mm": 1e3}
-ANGLES = ("rad", "deg")
+LENGTHS, ANGLES = {"m": 1.0, "mm": 1e3}, {"rad": 1.0, "deg": degrees(1.0)}
+"""Units of tables, per metre and per radian."""
 
 
 def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
@@ -24,19 +24,14 @@ def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
 
 def check_units(length: str, angle: str) -> None:
     """Raise InputError for a unit that tables do not have."""
-    for name, value, known in (("length", length, PER_METRE), ("angle", angle, ANGLES)):
+    for name, value, known in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
         if value not in known:
             raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
 
 
-def lengths(values: Sequence[float], unit: str) -> list[float]:
-    """Lengths in m -> in a unit."""
-    return [value * PER_METRE[unit] for value in values]
-
-
-def angles(values: Sequence[float], unit: str) -> list[float]:
-    """Angles in rad -> in a unit."""
-    return [degrees(value) if unit == "deg" else value for value in values]
+def in_unit(values: Sequence[float], unit: str) -> list[float]:
+    """Lengths in m or angles in rad -> in a unit."""
+    return [value * (LENGTHS | ANGLES)[unit] for value in values]
 
 
 def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

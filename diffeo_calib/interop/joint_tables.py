@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.interop.files import angles, check_units, lengths, table_text
+from diffeo_calib.interop.files import check_units, in_unit, table_text
 from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.tree import Tree
@@ -111,7 +111,7 @@ def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> s
     for table in tables:
         unit = angle if table.turns else length
         columns = (table.values, table.errors, table.corrections)
-        numbers = zip(*(_in_unit(column.tolist(), unit) for column in columns), strict=True)
+        numbers = zip(*(in_unit(column.tolist(), unit) for column in columns), strict=True)
         rows += [[table.joint, unit, *row] for row in numbers]
     return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
 
@@ -120,7 +120,7 @@ def offsets_text(found: JointOffsets, robot: Tree, length: str, angle: str) -> s
     """Joint offsets as CSV; see :func:`write_joint_offsets`."""
     units = [angle if turns else length for turns in robot.periodic]
     rows = [
-        [name, unit, *_in_unit([offset], unit)]
+        [name, unit, *in_unit([offset], unit)]
         for name, unit, offset in zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
     ]
     return table_text(["joint", "unit", "offset_to_add_to_reading"], rows)
@@ -142,7 +142,3 @@ def _table(model: CalibratedKinematics, index: int, step: float, turns: bool) ->
     between = float(((rows[1:] + rows[:-1]) / 2 - middle).abs().max())
     values, errors, corrections = (t.detach().cpu() for t in (q[::2], model.transmission(joint, q[::2]), rows))
     return CorrectionTable(joint, turns, values, errors, corrections, between)
-
-
-def _in_unit(values: Sequence[float], unit: str) -> list[float]:
-    return angles(values, unit) if unit in ("rad", "deg") else lengths(values, unit)

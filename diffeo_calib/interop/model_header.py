@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_number, positive
+from diffeo_calib.common.checks import as_tensor, check_covariance, check_number, positive
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -47,19 +47,16 @@ OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "p
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
-SCALES = "scales"
-"""Scales of kernels, priors and noise; the first model files did not have them."""
 GEOMETRY = ("base", "joint_errors", "tool")
-DATA = "data"
-"""Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
-WORKSPACE = "workspace"
-"""Configurations over which rigid motions are left out, for models of a robot that no device has seen."""
-SLOPES = "slopes"
-"""Linear functionals of the coordinates that were measured; without it, all coordinates were."""
-MEASURED = "measured"
-"""What was measured; the first model files did not have it."""
-RIGID_ERRORS = "rigid_errors"
-"""Joint errors of the geometric calibration alone; the first model files did not have them."""
+MAP_TENSORS = {
+    "data": "data",  # measured configurations of a coarse model; in others the control points x are these
+    "workspace": "workspace",  # of a robot that no device has seen: where covariances leave rigid motions out
+    "slopes": "slopes",  # linear functionals of the coordinates that were measured; without it, all coordinates were
+    "measured": "y",  # what was measured; the first model files did not have it
+}
+"""Tensors that only some models have -> attributes of the map."""
+ROBOT_TENSORS = ("rigid_errors", "scales")
+"""The same of a robot's model: joint errors of the geometric calibration alone, scales of kernels, priors and noise."""
 
 Tensors = dict[str, Tensor]
 KernelClasses = Mapping[str, type[Kernel]]
@@ -88,14 +85,14 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
-    known = {DATA: inner.data, WORKSPACE: inner.workspace, SLOPES: inner.slopes, MEASURED: inner.y}
+    known = {name: getattr(inner, attribute) for name, attribute in MAP_TENSORS.items()}
+    header: Header = {"report": {}, "lever": None}
+    if isinstance(model, CalibratedKinematics):
+        known |= {name: getattr(model, name) for name in ROBOT_TENSORS}
+        header = _of_robot(model)
     tensors |= {name: tensor for name, tensor in known.items() if tensor is not None}
     tensors |= describe_sessions(inner) | payload_tensors(inner)
-    if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
-        tensors[RIGID_ERRORS] = model.rigid_errors
-    if isinstance(model, CalibratedKinematics) and model.scales is not None:
-        tensors[SCALES] = model.scales
-    header: Header = {
+    header |= {
         "format": FORMAT,
         "units": UNITS,
         "nominal": nominal,
@@ -103,19 +100,15 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "task_kernel": _describe_kernel(spec.task_kernel),
         "task_dim": spec.task_dim,
         "integrator": deformation.integrator.to_config(),
-        "report": model.report if isinstance(model, CalibratedKinematics) else {},
-        "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
     if seen.registration is not None:
         header["registration"], found = describe_registration(seen.registration)
         tensors |= found
-    if isinstance(model, CalibratedKinematics):
-        header |= _optional(model)
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
-def _optional(model: CalibratedKinematics) -> Header:
-    """Entries that only some models have."""
+def _of_robot(model: CalibratedKinematics) -> Header:
+    """Entries of a robot's model, of which some have not all."""
     known = {
         "tool": model.tool.tolist() if model.has_tool else None,
         "tool_tip": model.tool_tip,
@@ -124,7 +117,8 @@ def _optional(model: CalibratedKinematics) -> Header:
         "ball": True if model.ball and model.map.workspace is None else None,
         "placement": [own.entry() for own in model.placement] or None,
     }
-    return {name: entry for name, entry in known.items() if entry is not None}
+    found = {name: entry for name, entry in known.items() if entry is not None}
+    return found | {"report": model.report, "lever": model.lever}
 
 
 def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
@@ -191,14 +185,14 @@ def rebuild(
     by_row = rebuild_sessions(by_row or nominal_map, tensors) or by_row
     spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
-    parts = Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise, tensors.get(WORKSPACE)
-    fitted = FittedMap(deformation, *parts, slopes=tensors.get(SLOPES), y=tensors.get(MEASURED))
+    known = {attribute: tensors.get(name) for name, attribute in MAP_TENSORS.items()}
+    fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), new_noise=new_noise, **known)
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
         given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
-        given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "scales": tensors.get(SCALES)}
+        given |= {name: tensors.get(name) for name in ROBOT_TENSORS}
         given["ball"] = header.get("ball", False) is True
         given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
@@ -217,9 +211,8 @@ def _check_names(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if isinstance(nominal, GeometryMap) and nominal.payload is not None:
         expected |= set(PAYLOADS)
-    optional = {DATA, SLOPES, MEASURED} | (
-        {RIGID_ERRORS, SCALES, WORKSPACE} if isinstance(nominal, GeometryMap) else set()
-    )
+    robot = isinstance(nominal, GeometryMap)
+    optional = {*MAP_TENSORS, *ROBOT_TENSORS} if robot else set(MAP_TENSORS) - {"workspace"}
     if set(tensors) - optional != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
 
@@ -231,7 +224,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         if tensor.dtype != torch.float64:
             raise InputError.of(f"the tensor {name}", expected="float64", got=tensor.dtype)
     (n_rows, n), (_, seen, _) = tensors["x"].shape, tensors["noise"].shape
-    m = tensors["new_noise"].shape[0] if SLOPES in tensors else seen
+    m = tensors["new_noise"].shape[0] if "slopes" in tensors else seen
     dim, size = header["task_dim"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
         raise InputError.of("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim)
@@ -239,7 +232,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         raise InputError.of("the entry report", expected="a table", got=type(header["report"]).__name__)
     if isinstance(nominal, GeometryMap) and n != nominal.geometry.chain.n:
         raise InputError.of("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n)
-    data = len(tensors.get(DATA, tensors["x"]))
+    data = len(tensors.get("data", tensors["x"]))
     shapes = {
         "x": (n_rows, n),
         "momenta_x": (n_rows, n),
@@ -248,21 +241,18 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "noise": (data, seen, seen),
         "prior_variance": (size,),
         "new_noise": (m, m),
-    } | {name: (rows, n) for name, rows in ((DATA, data), (WORKSPACE, "M")) if name in tensors}
-    own = {SLOPES: (data, seen, m), MEASURED: (data, seen)}
+    }
+    own = {"data": (data, n), "workspace": ("M", n), "slopes": (data, seen, m), "measured": (data, seen)}
     if isinstance(nominal, GeometryMap):
-        own[SCALES] = (5 * n + 2 * nominal.geometry.chain.moving + 9,)
+        own["scales"] = (5 * n + 2 * nominal.geometry.chain.moving + 9,)
     shapes |= {name: shape for name, shape in own.items() if name in tensors}
     for name, shape in shapes.items():
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
-    if SCALES in tensors and bool((tensors[SCALES] < 0).any()):
-        raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors[SCALES].min()))
-    new = tensors["new_noise"]
-    skewed = bool(((new - new.mT).abs() > 1e-9 * new.abs().max()).any())
-    if skewed or int(torch.linalg.cholesky_ex(new).info):
-        raise InputError.of("the tensor new_noise", expected="a symmetric positive definite matrix in m^2")
+    if "scales" in tensors and bool((tensors["scales"] < 0).any()):
+        raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors["scales"].min()))
+    check_covariance(tensors["new_noise"], "the tensor new_noise")
 
 
 def _rebuild_nominal(

@@ -73,20 +73,19 @@ class TorchProgram(nn.Module):
         self.output = output
         self.to_frame: Tensor | None
         self.register_buffer("to_frame", None)
-        deformation, marks, body = _exact(model), None, None
+        deformation = fitted = _exact(model)
+        self.of_robot = isinstance(model, CalibratedKinematics)
+        program, marks = program_of(fitted) if isinstance(model, CalibratedKinematics) else None, None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
             own = model.tool if tool is None else tool_transform(tool)
             body = ToolKinematics(model.map, model.nominal, own, frame, model.tool_tip)
             deformation, marks = body.deformation, tool_points(own, TOOL_LEVER)
             self.to_frame = torch.linalg.inv(body.base) if frame == "base" else None
-        self.of_robot = isinstance(model, CalibratedKinematics)
-        program = program_of(_exact(model)) if self.of_robot else None
-        if program is not None and body is not None:
-            program = program.at(body.tip)
+            program = None if program is None else program.at(body.tip)
         if program is None and dtype != torch.float64:
             what = "a program of a model with its own functions or kernels, which are recorded as they are,"
             raise InputError.of(what, expected="torch.float64", got=dtype)
-        self.points = _Recorded(deformation) if program is None else _ConstantPoints(program, marks)
+        self.points = deformation if program is None else _ConstantPoints(program, marks)
         self.to(dtype)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -119,17 +118,6 @@ class _ConstantPoints(nn.Module):
         tips = self.chain(self.joint_flow(q)).index_select(1, self.on)  # (N, P, 4, 4)
         placed = (tips[..., :3, :3] @ self.marks[..., None]).squeeze(-1) + tips[..., :3, 3]
         return self.task_flow(placed.reshape(-1, 3)).reshape(-1, self.marks.numel())
-
-
-class _Recorded(nn.Module):
-    """The model's own code, for users' kernels and functions: (N, n) -> (N, m)."""
-
-    def __init__(self, deformation: GeodesicDeformation) -> None:
-        super().__init__()
-        self.deformation = deformation
-
-    def forward(self, q: Tensor) -> Tensor:
-        return self.deformation(q)
 
 
 def export_torch(

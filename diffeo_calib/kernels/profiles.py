@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 
 MAX_ORDER = 3
@@ -28,7 +29,7 @@ class Profile(ABC):
     """kappa: [0, inf) -> R with kappa(0) = 1.
 
     Profiles of your own work with every backend. Sums are compiled where they use ``exp``, ``sqrt``, ``relu``,
-    arithmetic and numbers, and run on tensors else. A tensor that is to be optimised must be an attribute.
+    arithmetic and numbers, and run on tensors else, also where a parameter requires gradients.
     """
 
     @property
@@ -57,9 +58,12 @@ class Profile(ABC):
 
     @property
     def followed(self) -> bool:
-        """Whether autograd follows a parameter of the profile: an attribute that is a tensor."""
-        values = vars(self).values()
-        return torch.is_grad_enabled() and any(isinstance(value, Tensor) and value.requires_grad for value in values)
+        """Whether autograd or a transform of torch.func follows a parameter, wherever the profile has it from."""
+        if type(self) in SHIPPED:
+            return False
+        r2 = torch.zeros((), dtype=torch.float64, device=HOST)
+        kappa = self.derivative(r2, 0)
+        return isinstance(kappa, Tensor) and (kappa.requires_grad or wrapped(kappa) > wrapped(r2))
 
 
 class _Derivative(torch.autograd.Function):
@@ -244,3 +248,5 @@ PROFILES: dict[str, Profile] = {
     )
 }
 """All profiles by their names in model files."""
+SHIPPED = {type(profile) for profile in PROFILES.values()}
+"""Their classes: unlike those of a user, they have no parameter that torch follows, and always compute the same."""

@@ -223,6 +223,10 @@ class CalibratedKinematics:
         found = self.registration
         return refined if found is None else replace(refined, tool=found.markers)
 
+    def turns(self, q: Tensor) -> Tensor:
+        """(N, P, 3, 3) turns of the tips that carry the points at (N, n) joint values, by the geometry."""
+        return self.geometry.marker_poses(q)[..., :3, :3]
+
     @property
     def measured_frame(self) -> Tensor:
         """(4, 4) the measured frame of a model of poses in the tip's frame, m; of those of several tips (T, 4, 4).
@@ -396,7 +400,8 @@ class CalibratedKinematics:
             noise: whether the covariance is that of a new reading (default) or of the model alone.
 
         Returns:
-            one entry for every device; none for a model whose devices measure positions or poses, see :meth:`predict`.
+            one entry for every device, and for markers that were mounted anew (their positions); none for a model of
+            positions or poses alone, see :meth:`predict`.
         """
         return predicted_readings(self, self._joints(q).detach(), noise=noise)
 

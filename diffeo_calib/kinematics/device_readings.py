@@ -11,6 +11,7 @@ from the posterior of the fit. Devices that measured no row of the fit were plac
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,8 +22,9 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.places import MOUNTING, PlacedDevices, seen_mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class PredictedReadings:
     """What one device will report at N configurations.
 
     Args:
-        kind: of its readings. device: its name. unit: of the readings.
+        kind: of its readings; "position" of markers that were mounted anew. device: its name, or that of the session.
+        unit: of the readings.
         mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these.
     """
 
@@ -116,10 +119,11 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     """
     fitted: FittedMap = model.map
     sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
+    mounted = [one for own in model.placement if own.kind == MOUNTING for one in _mounted(model, own, q, noise=noise)]
     if not sets:
-        return []
+        return mounted
     seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in range(0, len(q), PREDICT_ROWS)]
-    found = []
+    found = mounted
     for own, devices in sets:
         unit, scale, zero = own.shown_as
         for number, name in enumerate(own.names):
@@ -130,6 +134,20 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
             covariance = torch.cat(blocks) * factor[:, None] * factor
             found.append(PredictedReadings(own.kind, name, unit, mean, covariance))
     return found
+
+
+def _mounted(model: Any, own: PlacedDevices, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
+    """Positions of the markers as they were mounted in other sessions than that of the model."""
+    mean, covariance = model.predict(q, noise=noise)
+    shifts, deviations = (each.unflatten(1, (-1, 3)) for each in (own.constants, own.deviations))
+    P = shifts.shape[1]
+    turns = model.turns(q)[:, :P]
+    for name, shift, std in zip(own.names, shifts, deviations, strict=True):
+        if bool(shift.any()):
+            places = 1e3 * (mean[:, :P] + (turns @ shift[..., None])[..., 0])
+            places = places.masked_fill(~seen_mounted(std)[:, None], torch.nan)
+            blocks = 1e6 * (covariance[:, :P] + turns @ torch.diag_embed(std.square()) @ turns.mT)
+            yield PredictedReadings("position", name, "mm", places.flatten(1), block_diagonal(blocks))
 
 
 def _seen(fitted: FittedMap, q: Tensor, some: slice) -> _Seen:

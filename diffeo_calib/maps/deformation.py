@@ -142,9 +142,9 @@ class Deformation(ABC):
         """Relative drift of the fields' energy along the flows, which the exact equations conserve."""
 
     @property
-    @abstractmethod
     def backends(self) -> tuple[str, str]:
         """Backends of the kernel sums between the control points: in joint space, in task space."""
+        return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
 
     @abstractmethod
     def to(self, device: torch.device | str) -> Deformation:

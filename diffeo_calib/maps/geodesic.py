@@ -24,7 +24,7 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.flows.geodesic import Flow, energy, row_blocks
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite, relative
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite, relative
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.nominal import NominalMap
 
@@ -109,11 +109,6 @@ class GeodesicDeformation(Deformation):
     def energy_drift(self) -> float:
         """The larger relative drift of the two Hamiltonians."""
         return max(self.joint_flow.energy_drift(), self.task_flow.energy_drift())
-
-    @property
-    def backends(self) -> tuple[str, str]:
-        """Backends of the kernel sums between the control points: in joint space, in task space."""
-        return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
 
     def to(self, device: torch.device | str) -> GeodesicDeformation:
         """The same deformation with its flows on a device."""

@@ -90,6 +90,7 @@ class SocketTable(RowTable):
     on: tuple[str, ...] | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    remounted: bool
     socket: Tensor | None
     sockets: Sockets | None
 
@@ -225,6 +226,7 @@ class SocketTable(RowTable):
         changes: dict[str, object] = {"marker_names": other.marker_names, "on": other.on}
         changes |= {} if other.std is None else {"std": torch.full_like(shown.points, torch.nan)}
         changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
+        changes["remounted"] = other.remounted
         return with_attributes(shown, **changes)
 
 

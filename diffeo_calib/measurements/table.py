@@ -74,7 +74,7 @@ class Measurements(ImageTable, SocketTable):
         std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, T, 3) for poses.
         rotation_std: (N, 3) or (N, T, 3) known standard deviations of the orientations, rad, about the measuring axes.
         session: (N,) int64, the set-up of the measuring device in which every row was measured, -1 for none; or None.
-        session_names: their names.
+        session_names: their names. remounted: whether the device stayed, and markers were mounted anew between them.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
         socket: (N,) int64, where the ball, the last marker, rested, -1 if a device measured. sockets: names, distances.
@@ -96,33 +96,10 @@ class Measurements(ImageTable, SocketTable):
             Nothing is dropped.
     """
 
-    BY_ROW = (
-        "q",
-        "points",
-        "poses",
-        "board",
-        "std",
-        "rotation_std",
-        "line_numbers",
-        "session",
-        "payload",
-        "socket",
-        "covariates",
-    )
-    BY_ROW = (*BY_ROW, *IMAGE_COLUMNS)
-    ALIKE = (
-        "joint_names",
-        "marker_names",
-        "on",
-        "lever",
-        "session_names",
-        "payload_at",
-        "covariate_names",
-        "sockets",
-        "n",
-        "markers",
-    )
-    ALIKE = (*ALIKE, "camera")
+    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = (*BY_ROW, "covariates", *IMAGE_COLUMNS)
+    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (*ALIKE, "covariate_names", "camera", "remounted")
 
     q: Tensor
     points: Tensor
@@ -136,6 +113,7 @@ class Measurements(ImageTable, SocketTable):
     rotation_std: Tensor | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    remounted: bool
     payload: Tensor | None
     payload_at: str | None
     socket: Tensor | None
@@ -165,8 +143,8 @@ class Measurements(ImageTable, SocketTable):
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
-        set_attributes(self, file_sha256=None, origin=None)
+        set_attributes(self, session=None, session_names=(), remounted=False, socket=None, sockets=None)
+        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             self.check_every_marker_seen()
             self.warn_if_suspicious()
@@ -436,16 +414,24 @@ class Measurements(ImageTable, SocketTable):
         points = 1 if self.poses is None else POINTS
         return with_attributes(self, on=tip_names(on, self.markers // points, points))
 
-    def with_sessions(self, names: Sequence[str] | None) -> Measurements:
+    def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
 
         A calibration gives each set-up its own measuring frame; its model is in that of the largest.
 
+        Args:
+            names: of the set-ups; None for one.
+            remounted: whether the device stayed instead, and the markers were mounted anew for each set-up: they all
+                have one measuring frame, and each its own places of the markers; the model's are those of the largest.
+
         Raises:
-            MeasurementError: not one name per row.
+            MeasurementError: not one name per row, or poses with markers mounted anew.
         """
         numbers, known = session_numbers(names, len(self))
-        return with_attributes(self, session=numbers, session_names=known)
+        if remounted and self.lever is not None:
+            fix = "give their positions alone (leave the rotation out)"
+            raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)
+        return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
 
     def check_every_marker_seen(self) -> None:
         """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""
@@ -475,6 +461,12 @@ class Measurements(ImageTable, SocketTable):
         largest = torch.bincount(self.session[self.session >= 0]).argmax()
         return self.rows(self.session == largest).with_sessions(None)
 
+    def shifted(self, shifts: Tensor) -> Measurements:
+        """The rows with their first markers moved, (N, P, 3) m, as one session."""
+        rest = self.points[:, shifts.shape[1] :]
+        points = torch.cat([self.points[:, : shifts.shape[1]] + shifts, rest], 1)
+        return with_attributes(self, points=points, session=None, session_names=(), remounted=False)
+
     def in_frames(self, transforms: Tensor) -> Measurements:
         """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.
 
@@ -484,6 +476,7 @@ class Measurements(ImageTable, SocketTable):
         T = transforms.to(self.points)
         R, shift = T[:, :3, :3], T[:, None, :3, 3]
         changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
+        changes["remounted"] = False
         changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses

@@ -40,6 +40,7 @@ class TableFormat:
         payload: name of the column with the known mass that the robot carries, in any unit.
         time, temperature: names of columns with which something may drift, in any unit.
         camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
+        remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -60,6 +61,7 @@ class TableFormat:
     time: str | None = None
     temperature: str | None = None
     camera_on_tool: bool = False
+    remounted: bool = False
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))

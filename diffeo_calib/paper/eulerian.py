@@ -39,7 +39,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
@@ -256,11 +256,6 @@ class EulerianDeformation(Deformation):
         """Relative drift of 1/2 |v|^2 + 1/2 |w|^2, an error of this formulation that small time steps do not remove."""
         start, end = (float(sum(self._energies(node))) for node in (self.flow.nodes[0], self.flow.nodes[-1]))
         return abs(end - start) / start if start > 0 else 0.0
-
-    @property
-    def backends(self) -> tuple[str, str]:
-        """Backends of the kernel sums between the data: in joint space, in task space."""
-        return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
 
     def to(self, device: torch.device | str) -> EulerianDeformation:
         """The same deformation with its flow on a device."""

@@ -98,8 +98,14 @@ def from_dh(
         raise RobotError.of("the DH table is empty", fix="pass one row (a, alpha, d) for each joint")
     names = _names(names, len(table))
     joints = []
-    for row, joint_name in zip(table, names, strict=True):
-        joints += _standard(row, joint_name) if convention == "standard" else _craig(row, joint_name)
+    eye = torch.eye(4, dtype=torch.float64, device="cpu")
+    for row, joint_name in zip(table, names, strict=True):  # standard: the joint moves first, in the previous frame
+        standard = convention == "standard"
+        before, after = (eye, row_transform(row)) if standard else (_about_x(row), _about_z(row))
+        joints += [
+            Joint(joint_name, row.kind, before, mimic=row.mimic, mimic_offset=row.mimic_offset),  # the axis is z
+            Joint(f"{joint_name} (link)", "fixed", after),
+        ]
     parents = [index - 1 if row.parent is None else row.parent for index, row in enumerate(table)]
     ends = [index for index in range(len(table)) if index not in parents]
     if tips is None and len(ends) == 1:
@@ -181,26 +187,6 @@ def _check_units(what: str, row: Sequence[float]) -> None:
     length = max(a, d, key=abs)
     if abs(length) > LONGEST_LINK_M:
         warn_user(sentence(f"a length in {what} is {length:g} m", fix="divide by 1000 if it is in mm"))
-
-
-def _standard(row: DHRow, name: str) -> list[Joint]:
-    # The joint moves first: its frame is the previous row's, and all of this row is a fixed transform after it.
-    return [
-        _moving(row, name, torch.eye(4, dtype=torch.float64, device="cpu")),
-        _fixed(name, row_transform(row)),
-    ]
-
-
-def _craig(row: DHRow, name: str) -> list[Joint]:
-    return [_moving(row, name, _about_x(row)), _fixed(name, _about_z(row))]
-
-
-def _moving(row: DHRow, name: str, origin: Tensor) -> Joint:
-    return Joint(name, row.kind, origin, mimic=row.mimic, mimic_offset=row.mimic_offset)  # the axis is z
-
-
-def _fixed(name: str, origin: Tensor) -> Joint:
-    return Joint(f"{name} (link)", "fixed", origin)
 
 
 def _about_z(row: DHRow) -> Tensor:

@@ -8,7 +8,7 @@ through. The value of a mimic joint is an affine function of the values of activ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import inf, isfinite, isnan
 from typing import Any
 
@@ -90,16 +90,9 @@ class Joint:
 
     def to_config(self) -> dict[str, Any]:
         """The constructor's arguments as JSON values; None stands for an infinite limit."""
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "origin": self.origin.tolist(),
-            "axis": self.axis.tolist(),
-            "lower": self.lower if isfinite(self.lower) else None,
-            "upper": self.upper if isfinite(self.upper) else None,
-            "mimic": self.mimic,
-            "mimic_offset": self.mimic_offset,
-        }
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values |= {name: values[name].tolist() for name in ("origin", "axis")}
+        return values | {name: values[name] if isfinite(values[name]) else None for name in ("lower", "upper")}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Joint:
@@ -108,8 +101,7 @@ class Joint:
         Raises:
             KeyError: an argument is missing.
         """
-        names = ("name", "kind", "origin", "axis", "lower", "upper", "mimic", "mimic_offset")
-        arguments = {name: config[name] for name in names}
+        arguments = {each.name: config[each.name] for each in fields(cls)}
         for name in ("origin", "axis"):
             arguments[name] = torch.tensor(arguments[name], dtype=torch.float64, device="cpu")
         for name, infinite in (("lower", -inf), ("upper", inf)):

@@ -8,19 +8,17 @@ robotics", 2018.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import atan2, cos, factorial, sin
+from math import atan2, cos, sin
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import RobotError
+from diffeo_calib.runtime.chain import smooth
 
 RIGID_TOLERANCE = 1e-6
 """Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
-SERIES_TERMS = 11
-"""Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
 
 def skew(vectors: Tensor) -> Tensor:
@@ -35,8 +33,8 @@ def rotation(w: Tensor) -> Tensor:
     """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     one = torch.eye(3, dtype=w.dtype, device=w.device)
-    sine = _smooth(x, 1, lambda a: a.sin() / a)
-    return one + sine * W + _smooth(x, 2, _versine) * (W @ W)
+    sine = smooth(x, 1, lambda a: a.sin() / a, torch.where)
+    return one + sine * W + smooth(x, 2, _versine, torch.where) * (W @ W)
 
 
 def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -65,7 +63,11 @@ def right_jacobian(w: Tensor) -> Tensor:
     """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     one = torch.eye(3, dtype=w.dtype, device=w.device)
-    return one - _smooth(x, 2, _versine) * W + _smooth(x, 3, lambda a: (a - a.sin()) / a**3) * (W @ W)
+    return (
+        one
+        - smooth(x, 2, _versine, torch.where) * W
+        + smooth(x, 3, lambda a: (a - a.sin()) / a**3, torch.where) * (W @ W)
+    )
 
 
 def transforms(rotations: Tensor, translations: Tensor) -> Tensor:
@@ -113,16 +115,3 @@ def rigid(value: object, name: str) -> Tensor:
 
 def _versine(a: Tensor) -> Tensor:
     return 2 * ((a / 2).sin() / a) ** 2  # (1 - cos a) / a^2 without cancellation
-
-
-def _smooth(x: Tensor, order: int, closed: Callable[[Tensor], Tensor]) -> Tensor:
-    """A function of the angle a, in terms of x = a^2: sum_k (-x)^k / (2 k + order)! below 1, else its closed form.
-
-    Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
-    """
-    small = x < 1
-    near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
-    series = torch.zeros_like(x)
-    for k in reversed(range(SERIES_TERMS)):  # Horner
-        series = 1 / factorial(2 * k + order) - near * series
-    return torch.where(small, series, closed(far.sqrt()))

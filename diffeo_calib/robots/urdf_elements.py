@@ -85,11 +85,20 @@ class URDF:
         root, ignored = _parse(content, path)
         links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
         joints = [_read_joint(element, path) for element in root.findall("joint")]
-        return cls(path, root.get("name") or path.stem, links, joints, ignored, _has_xacro(root))
+        macros = any(element.prefix == "xacro" or str(element.tag).startswith("xacro:") for element in root)
+        return cls(path, root.get("name") or path.stem, links, joints, ignored, macros)
 
     def check_link(self, role: str, name: str) -> None:
         """Raise RobotError unless there is a link of this name; ``role`` is the argument that names it."""
-        _known(role, name, self.links, self.path, xacro=self.macros)
+        if name in self.links:
+            return
+        if self.macros:
+            what = f"`{role}`: '{self.path}' has no link '{name}', but macros that may make it"
+            raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
+        near = get_close_matches(name, self.links, n=3)
+        hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
+        what = f"`{role}`: '{self.path}' has no link '{name}'"
+        raise RobotError.of(what, fix=f"{hint}its links are {few(self.links, MOST_NAMES) or '(none)'}")
 
 
 def content_of(path: Path) -> bytes:
@@ -136,11 +145,6 @@ def _parse(content: bytes, path: Path) -> tuple[Any, list[str]]:
         for element in root.iter(f"{{{name.namespace}}}*"):
             element.tag = etree.QName(element).localname
     return root, sorted({fault for fault in faults if fault is not None})
-
-
-def _has_xacro(root: Any) -> bool:
-    """Whether macros are left in the file, so that parts of the robot may be missing."""
-    return any(element.prefix == "xacro" or str(element.tag).startswith("xacro:") for element in root)
 
 
 def _read_joint(joint: Any, path: Path) -> JointElement:
@@ -200,18 +204,6 @@ def _attribute(element: Any, name: str, what: str, path: Path) -> str:
     if not value:
         raise RobotError.of(f"{what} in '{path}' has no attribute '{name}'", fix="add it")
     return value
-
-
-def _known(role: str, name: str, links: list[str], path: Path, *, xacro: bool) -> None:
-    if name in links:
-        return
-    if xacro:
-        what = f"`{role}`: '{path}' has no link '{name}', but macros that may make it"
-        raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
-    near = get_close_matches(name, links, n=3)
-    hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
-    what = f"`{role}`: '{path}' has no link '{name}'"
-    raise RobotError.of(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}")
 
 
 def harmless_faults(joint: JointElement) -> list[str]:

@@ -19,7 +19,7 @@ import numpy as np
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau
 from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
-from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
@@ -385,9 +385,9 @@ def recorded_stages(
     for _ in range(steps):
         slopes: list[Array] = []
         for row in coefficients:
-            stages.append(_combined(state, row, slopes))
+            stages.append(combined(state, row, slopes))
             slopes.append(_slope(kernel, stages[-1]))
-        state = _combined(state, weights, slopes)
+        state = combined(state, weights, slopes)
     return np.stack(stages), state
 
 
@@ -401,9 +401,3 @@ def _slope(kernel: Sequence[Mapping[str, Any]], state: Array) -> Array:
             v, dv = term.velocity_and_jacobian(0, q)
             total += np.stack([v, -(dv.swapaxes(1, 2) @ a[..., None])[..., 0]])
     return total
-
-
-def _combined(state: Array, coefficients: Array, slopes: Sequence[Array]) -> Array:
-    for c, slope in zip(coefficients, slopes, strict=False):
-        state = state + c * slope
-    return state

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import factorial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, cross
+
+SERIES_TERMS = 11
+"""Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,17 +286,24 @@ def transforms(twists: Array) -> Array:
 def _right_jacobian(w: Array) -> Array:
     """Jr of SO(3): (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    return _ONE - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W + _third(x) * (W @ W)
+    return (
+        _ONE
+        - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W
+        + smooth(x, 3, lambda a: (a - np.sin(a)) / a**3, np.where) * (W @ W)
+    )
 
 
-def _third(x: Array) -> Array:
-    """(a - sin a) / a^3 with x = a^2: the series below 1, where the difference would cancel."""
+def smooth(x: Any, order: int, closed: Callable[[Any], Any], where: Callable[..., Any]) -> Any:
+    """A function of the angle a, in terms of x = a^2: sum_k (-x)^k / (2 k + order)! below 1, else its closed form.
+
+    Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
+    """
     small = x < 1.0
-    near, far = np.where(small, x, 0.0), np.sqrt(np.where(small, 1.0, x))
-    series = np.zeros_like(x)
-    for factor in _THIRD:
-        series = factor - near * series
-    return np.where(small, series, (far - np.sin(far)) / far**3)
+    near, far = where(small, x, 0.0), where(small, 1.0, x)
+    series = 0.0
+    for k in reversed(range(SERIES_TERMS)):  # Horner
+        series = 1.0 / factorial(2 * k + order) - near * series
+    return where(small, series, closed(far**0.5))
 
 
 def skew(w: Array) -> Array:
@@ -303,6 +314,4 @@ def skew(w: Array) -> Array:
 _ONE = np.eye(3)
 _SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
 """w @ _SKEW is [w]x, row by row."""
-_THIRD = [1.0 / float(np.prod(np.arange(1, 2 * k + 4))) for k in reversed(range(11))]
-"""1 / (2 k + 3)!, the last first."""
 NUMPY = Operations(np.sin, np.cos, np.stack, np.broadcast_to, transforms, np.linalg.inv)

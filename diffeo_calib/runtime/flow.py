@@ -6,9 +6,10 @@ of the Runge-Kutta run that moved the controls (flows/geodesic.py).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -178,13 +179,14 @@ class RecordedFlow:
         """The flow of points (N, n)."""
         if self.vanishes:
             return x
-        return np.concatenate([self._advance(x[rows]) for rows in self._blocks(len(x))])
+        return np.concatenate([self._advance(x[rows], None)[0] for rows in self._blocks(len(x))])
 
     def with_jacobian(self, x: Array) -> tuple[Array, Array]:
         """The flow (N, n) and its Jacobian (N, n, n)."""
+        M = np.broadcast_to(np.eye(self.size), (len(x), self.size, self.size))
         if self.vanishes:
-            return x, np.broadcast_to(np.eye(self.size), (len(x), self.size, self.size))
-        parts = [self._advance_with_jacobian(x[rows]) for rows in self._blocks(len(x))]
+            return x, M
+        parts = [self._advance(x[rows], M[rows]) for rows in self._blocks(len(x))]
         return np.concatenate([p for p, _ in parts]), np.concatenate([m for _, m in parts])
 
     def velocity(self, stage: int, x: Array) -> Array:
@@ -209,27 +211,21 @@ class RecordedFlow:
             dv[:, self._diagonal, self._diagonal] += slope
         return v, dv
 
-    def _advance(self, x: Array) -> Array:
-        first = 0
-        for _ in range(self.steps):
-            slopes: list[Array] = []
-            for stage, row in enumerate(self._scaled[0]):
-                slopes.append(self.velocity(first + stage, _combined(x, row, slopes)))
-            x = _combined(x, self._scaled[1], slopes)
-            first += len(slopes)
-        return x
-
-    def _advance_with_jacobian(self, x: Array) -> tuple[Array, Array]:
-        first, M = 0, np.broadcast_to(np.eye(self.size), (len(x), self.size, self.size))
-        for _ in range(self.steps):
+    def _advance(self, x: Array, M: Any) -> tuple[Array, Any]:
+        """The end of the flow of x, and that of M' = Dv M; None for none."""
+        coefficients, weights = self._scaled
+        for step in range(self.steps):
             slopes: list[Array] = []
             turns: list[Array] = []
-            for stage, row in enumerate(self._scaled[0]):
-                v, dv = self.velocity_and_jacobian(first + stage, _combined(x, row, slopes))
+            for stage, row in enumerate(coefficients, step * len(weights)):
+                at = combined(x, row, slopes)
+                if M is None:
+                    slopes.append(self.velocity(stage, at))
+                    continue
+                v, dv = self.velocity_and_jacobian(stage, at)
                 slopes.append(v)
-                turns.append(dv @ _combined(M, row, turns))
-            x, M = _combined(x, self._scaled[1], slopes), _combined(M, self._scaled[1], turns)
-            first += len(slopes)
+                turns.append(dv @ combined(M, row, turns))
+            x, M = combined(x, weights, slopes), M if M is None else combined(M, weights, turns)
         return x, M
 
     def _blocks(self, rows: int) -> Iterator[slice]:
@@ -251,7 +247,7 @@ class RecordedFlow:
         return [] if self.tables is None else list(self.tables.joints)
 
 
-def _combined(x: Array, coefficients: Sequence[float], slopes: Sequence[Array]) -> Array:
+def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:
     """x + sum_k c_k slope_k."""
     for c, slope in zip(coefficients, slopes, strict=False):
         if c:

@@ -195,14 +195,12 @@ class JointTables:
 
     def values(self, stage: int, x: Array) -> Array:
         """f of every joint: x (N, n) -> (N, L)."""
-        c, u = self._cells(stage, x)
-        return ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+        return _quintic(*self._cells(stage, x))
 
     def derivatives(self, stage: int, x: Array) -> tuple[Array, Array]:
         """f and the derivative of the interpolated f, of every joint: x (N, n) -> (N, L) each."""
         c, u = self._cells(stage, x)
-        values = ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
-        return values, (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
+        return _quintic(c, u), (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
 
     def _cells(self, stage: int, x: Array) -> tuple[Array, Array]:
         """Coefficients (6, N, L) of the polynomials around x, and the places (N, L) from their knots."""
@@ -231,6 +229,10 @@ class JointTables:
         ]
 
 
+def _quintic(c: Array, u: Array) -> Array:
+    return ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+
+
 def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
     """A table of the sum of these functions; None if it would need more than :data:`MOST_CELLS` cells."""
     knots = _apart(np.concatenate([np.linspace(0.0, TURN, FEWEST_CELLS + 1), *(s.kinks for s in sums)]))
@@ -240,8 +242,7 @@ def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
     while open_cells.any():
         middles = 0.5 * (knots[:-1] + knots[1:])[open_cells]
         c, u = Table(knots, values).coefficients[:, open_cells], middles - knots[:-1][open_cells]
-        found = ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
-        wrong = np.abs(found - sum(s.values(middles) for s in sums)) > limit
+        wrong = np.abs(_quintic(c, u) - sum(s.values(middles) for s in sums)) > limit
         if len(knots) + int(wrong.sum()) > MOST_CELLS:
             return None
         cells = np.flatnonzero(open_cells)[wrong]

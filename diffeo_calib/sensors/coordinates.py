@@ -27,12 +27,15 @@ from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Ev
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.places import (
     BALL_IS_THE_MARKER,
+    MOUNTING,
     ROWS,
     SESSION,
     SOCKET,
+    MountedMarkers,
     PlacedDevices,
     Places,
     SessionPlaces,
+    Turns,
     place_sessions,
     placed,
     sensor_key,
@@ -54,6 +57,8 @@ class Beside:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
         devices: those of readings whose places are known, by kind.
         frames: name of a set-up of positions -> (4, 4) transform from the frame of the kinematics to its own, m.
+        mounted: the markers of set-ups that the kinematics know, or of none, for rows whose markers were mounted anew;
+            None for kinematics that do not tell how their tips turn.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
     """
@@ -61,6 +66,7 @@ class Beside:
     points: Callable[[Any], Tensor]
     devices: Mapping[str, Devices]
     frames: Mapping[str, Tensor] = field(default_factory=dict)
+    mounted: MountedMarkers | None = None
     unplaced: bool = False
     every_session: bool = False
 
@@ -92,8 +98,11 @@ class Sensor(ABC):
         """The rows of one set-up whose device says where the robot stands; None where none does."""
 
     @abstractmethod
-    def settled(self, data: Any, points: Tensor) -> tuple[PlacedDevices, ...]:
-        """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them."""
+    def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
+        """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them.
+
+        ``turns`` of the tips that carry the points: see :class:`MountedMarkers`.
+        """
 
 
 class Positions(Sensor):
@@ -116,6 +125,8 @@ class Positions(Sensor):
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of several set-ups, or of rows that no device shares with the model."""
         names = {name for name in data.device_names if name}
+        if data.remounted:
+            return self._mounted(data, beside, names)
         if len(names) == 1 and names <= set(beside.frames) and not beside.every_session:
             (name,) = names
             return Places(SessionPlaces((name,), beside.frames[name][None]))
@@ -127,6 +138,17 @@ class Positions(Sensor):
             return Places()
         found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.sentences()
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
+
+    def _mounted(self, data: Measurements, beside: Beside, names: set[str]) -> Places:
+        """The markers of set-ups between which they were mounted anew: those that are known, the others anew."""
+        known = beside.mounted
+        if known is None:
+            what = "rows whose markers were mounted anew"
+            raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
+        if not names <= set(known.names):
+            found = MountedMarkers.of(beside.points(data), data, known.turns)
+            known = known.beside(found) if known.names else found
+        return Places(known, found=tuple(known.sentences()), numbers=known.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Distances, and angles of poses."""
@@ -150,10 +172,14 @@ class Positions(Sensor):
         """Of several set-ups the one with most rows."""
         return data.largest_session()
 
-    def settled(self, data: Measurements, points: Tensor) -> tuple[PlacedDevices, ...]:
-        """The frames of several set-ups; that of one is the frame of the model."""
+    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
+        """The frames of several set-ups, or their markers; those of one are those of the model."""
         if len(data.session_names) < 2:
             return ()
+        if data.remounted:
+            own = MountedMarkers.of(points, data, turns)
+            shifts, deviations = own.shifts.flatten(1), own.deviations.flatten(1)
+            return (PlacedDevices.outside(MOUNTING, own.names, shifts, deviations),)
         found = place_sessions(points, data)
         transforms = found.transforms.flatten(1)
         return (PlacedDevices.outside(SESSION, found.names, transforms, transforms[:, :0]),)
@@ -208,7 +234,7 @@ class Contacts(Sensor):
     def set_up(self, data: Measurements) -> None:
         """None: a ball in a socket is where the robot brought it."""
 
-    def settled(self, data: Measurements, points: Tensor) -> tuple[PlacedDevices, ...]:
+    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The middles of the sockets, with the standard deviations of these."""
         socket, known = sockets_of(data)
         numbers = socket.unique()
@@ -271,7 +297,7 @@ class OtherDevices(Sensor):
     def set_up(self, data: Readings) -> None:
         """None: these devices are placed around the robot."""
 
-    def settled(self, data: Readings, points: Tensor) -> tuple[PlacedDevices, ...]:
+    def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The devices, with the standard deviations of their increments."""
         found = placed(data, points)
         seen = found.points_of(points)

@@ -2,7 +2,7 @@
 
 A kind of your own is a subclass of :class:`Devices`, given to :func:`register`: see scripts/examples/laser_line.py and
 inclinometer.py. The command line knows it if a package that is installed names its module as an entry point of
-``diffeo_calib.sensors``; tables then have ``--reading KIND=COLUMN,...``.
+``diffeo_calib.sensors``; tables then have ``--reading KIND=COLUMN,...``, and ``init`` finds these by their names.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ Where the devices of a calibration were found: what a model keeps of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera
 from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
 from diffeo_calib.sensors.kinds import kind_of, known_kinds
@@ -89,26 +89,114 @@ def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
     Raises:
         MeasurementError: no sessions, or fewer than 4 rows in one.
     """
-    if data.session is None:
-        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-    present = data.session[data.session != NO_SOCKET].unique().tolist()
-    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
-    for place, number in enumerate(present):
-        own[data.session == number] = place
-    check_rows_of_sessions(own, names)
+    names, own = sessions_of(data)
     predicted = predicted[:, : data.markers]
     rows = [(own == place).to(predicted.device) for place in range(len(names))]
     found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
     return SessionPlaces(names, torch.stack(found))
 
 
-def check_rows_of_sessions(session: Tensor, names: tuple[str, ...]) -> None:
-    """Raise MeasurementError for a session of too few rows: (N,) their numbers, -1 for none, and names."""
-    counts = torch.bincount(session[session != NO_SOCKET], minlength=len(names))
-    for name, count in zip(names, counts.tolist(), strict=True):
-        if count < FEWEST_ROWS:
-            fix = "measure more rows in it, or leave it out"
-            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=count, fix=fix)
+@dataclass(frozen=True, eq=False)
+class MountedMarkers:
+    """Where the markers sat in some sessions of one measuring frame.
+
+    Args:
+        names: S sessions. shifts: (S, P, 3) of the markers from those of the model, in the frames of their tips, m.
+        deviations: (S, P, 3) of these, m.
+        turns: (N, n) joint values -> (N, P', 3, 3) turns of the tips that carry the model's points, P' >= P.
+        new: names of the sessions whose shifts were found from the rows that are judged.
+    """
+
+    names: tuple[str, ...]
+    shifts: Tensor
+    deviations: Tensor
+    turns: Turns
+    new: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, predicted: Tensor, data: Measurements, turns: Turns) -> MountedMarkers:
+        """The sessions of some rows where these fit points (N, P, 3) of the model's markers best, m; see the class."""
+        names, whose = sessions_of(data)
+        P = min(data.markers, predicted.shape[1])
+        away = turns(data.q)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
+        found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
+        shifts, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
+        return cls(names, shifts, deviations, turns, names)
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """Rows of these sessions with the markers of the model; rows that name no session have these."""
+        known = [*self.names, ""]
+        whose = torch.tensor([known.index(name) for name in data.device_names], dtype=torch.int64, device=HOST)
+        shifts = torch.cat([self.shifts, self.shifts[:1] * 0.0])[whose].to(data.points)
+        return data.shifted(-(self.turns(data.q)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
+
+    def beside(self, other: MountedMarkers) -> MountedMarkers:
+        """These, and those of other names."""
+        new = [number for number, name in enumerate(other.names) if name not in self.names]
+        names = tuple(other.names[number] for number in new)
+        values = ((getattr(one, k) for one in (self, other)) for k in ("shifts", "deviations"))
+        shifts, deviations = (torch.cat([own, theirs[new]]) for own, theirs in values)
+        return replace(self, names=(*self.names, *names), shifts=shifts, deviations=deviations, new=names)
+
+    @property
+    def fitted_numbers(self) -> int:
+        """How many numbers were found from the rows that are judged."""
+        return len(self.new) * self.shifts[0].numel()
+
+    def sentences(self) -> list[str]:
+        """What was found from the rows that are judged."""
+        lines = [f"{self.fitted_numbers} numbers were found from these rows: errors of few rows flatter"]
+        return (lines + mounted_sentences(self.names, self.shifts, self.deviations)) if self.new else []
+
+
+Turns = Callable[[Tensor], Tensor]
+
+
+def _middle(away: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (P, 3) of shifts (M, P, 3) but for gross outliers, and its standard deviations; zero of hidden markers."""
+    middle = away.nanmedian(0).values
+    size = (away - middle).norm(dim=2)
+    kept = torch.where((size <= GROSS_DISTANCES * size.nanmedian(0).values)[..., None], away, torch.nan)
+    count = (~kept.isnan()).sum(0).clamp(min=1)
+    mean = kept.nanmean(0).nan_to_num(0.0)
+    return mean, ((kept - mean).square().nanmean(0).sqrt() / count.sqrt()).nan_to_num(PLACES.remounted_m)
+
+
+def seen_mounted(deviations: Tensor) -> Tensor:
+    """(..., P) boolean: markers that rows of their session showed, by the deviations (..., P, 3) of their places, m."""
+    return deviations.amax(-1) < 0.5 * PLACES.remounted_m
+
+
+def mounted_sentences(names: Sequence[str], shifts: Tensor, deviations: Tensor) -> list[str]:
+    """How far the markers (S, P, 3) of every session are from those of the model, m; none for the model's own."""
+    lines = []
+    for name, shift, std in zip(names, shifts, deviations, strict=True):
+        sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
+        seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
+        known = ", ".join(f"{size:.3f} +- {own:.3f} mm" if shown else "not seen" for (size, own), shown in seen)
+        if bool(shift.any()):
+            markers = "markers are" if len(shift) > 1 else "marker is"
+            lines.append(f"session '{name}': its {markers} {known} away from that of the model")
+    return lines
+
+
+def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
+    """Names of the sessions of some rows, and (N,) the number of each row's, -1 for none.
+
+    Raises:
+        MeasurementError: no sessions, or fewer than 4 rows in one.
+    """
+    if data.session is None:
+        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+    present = data.session[data.session != NO_SOCKET].unique().tolist()
+    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
+    for place, (number, name) in enumerate(zip(present, names, strict=True)):
+        rows = data.session == number
+        own[rows] = place
+        if int(rows.sum()) < FEWEST_ROWS:
+            fix, got = "measure more rows in it, or leave it out", int(rows.sum())
+            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
+    return names, own
 
 
 def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
@@ -176,8 +264,9 @@ def placed(data: Readings, points: Tensor) -> Devices:
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None
 
 
-SESSION, SOCKET = "session", "socket"
-"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
+SESSION, SOCKET, MOUNTING = "session", "socket", "mounting"
+"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, and markers
+that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m."""
 MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
@@ -239,7 +328,7 @@ class PlacedDevices:
             return replace(self, constants=moved.flatten(1))
         if self.kind == SOCKET:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
-        if self.devices is None:
+        if self.devices is None:  # what is on the tool
             return self
         each = [_carried(self.devices, number, before, after) for number in range(len(self.names))]
         return replace(self, constants=torch.stack(each))
@@ -263,6 +352,10 @@ class PlacedDevices:
         devices = self.devices
         if devices is not None:
             return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        if self.kind == MOUNTING:
+            return mounted_sentences(
+                self.names, *(each.unflatten(1, (-1, 3)) for each in (self.constants, self.deviations))
+            )
         places = (
             self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
         )  # of transforms, row by row

@@ -340,7 +340,8 @@ def reading_devices(result: Result) -> Numbers:
 def errors(result: Result, rows: Rows) -> Numbers:
     """What summary and evaluation say."""
     if isinstance(rows, dc.Readings):
-        return {"errors": result.reading_errors(rows)[1], "evaluation": one(dc.evaluate(result.model, rows).rms)}
+        own = reading_bank.reading_errors(result, rows)
+        return {"errors": own, "evaluation": one(dc.evaluate(result.model, rows).rms)}
     summary, parts = result.model.summary, one(*(part.displacement for part in result.parts))
     assert summary is not None
     stages = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms

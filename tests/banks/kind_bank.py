@@ -113,12 +113,32 @@ def _inclinations() -> Source:
     return _of_arm(replace(known, rows=rows), 0.25, arm, (0, 1, 2))
 
 
+MOUNTED = torch.tensor([[0.0, 0.0, 0.0], [3e-3, -4e-3, 0.0], [-2e-3, 1e-3, 4.5e-3]], dtype=torch.float64)
+"""Places of the marker in three sessions, from that of the first, in the frame of the tip, m."""
+
+
+def remounted(arm: SimulatedArm, rows: dc.Measurements, shifts: Tensor = MOUNTED) -> dc.Measurements:
+    """Rows of one marker as those of sessions in turn, for each of which it was mounted anew; "a" has most rows."""
+    turn = torch.arange(len(rows)) % 5
+    whose = torch.where(turn < len(shifts), turn, 0)
+    turns = arm.truth.marker_poses(rows.q)[..., :3, :3]
+    moved = rows.shifted((turns @ shifts[whose][:, None, :, None])[..., 0])
+    return moved.with_sessions(["abcdefg"[number] for number in whose.tolist()], remounted=True)
+
+
+def _remounted() -> Source:
+    known, arm = golden_bank.positions(96), SimulatedArm(seed=1)
+    rows: Any = known.rows
+    return _of_arm(replace(known, rows=remounted(arm, rows)), 0.2, arm)
+
+
 SOURCES: dict[str, Callable[[], Source]] = {
     "positions": lambda: _of_arm(golden_bank.positions(56), 0.2, SimulatedArm(seed=1)),
     "poses": _poses,
     "hidden markers": lambda: _of_arm(golden_bank.hidden(), 0.25, SimulatedArm(seed=1, markers=3), (0, 1, 2)),
     "several tips": _tips,
     "sessions": _sessions,
+    "markers mounted anew": _remounted,
     "payloads": lambda: _of_arm(golden_bank.payloads(56), 0.25, SimulatedArm(seed=1), payload=4.0),
     "ball in sockets": lambda: _of_arm(golden_bank.sockets(), 2.0, SimulatedArm(seed=0)),
     "mixture": lambda: _of_arm(golden_bank.mixture(), 0.5, SimulatedArm(seed=3, markers=2), (1, 0)),
@@ -267,6 +287,7 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
     found += ["--camera-on-tool"] * (
         table.camera_on_tool or any(getattr(own, "camera_on_tool", 0) for own in columns.readings)
     )
+    found += ["--remounted"] * table.remounted
     found += [] if table.payload is None else ["--payload", table.payload]
     if columns.sockets is not None:
         known = columns.sockets

@@ -9,6 +9,7 @@ from tangent_bank import normal
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.result import STAGES, CalibrationResult
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import transforms
 
@@ -73,3 +74,9 @@ def scales() -> dc.Hyperparameters:
         *(each(1e-6, 6), each(1.0), each(2e-5), each(2e-5), each(1e-4), each(5e-4), each(5e-4)),
         *(each(2e-4, 6), each(1e-5, 6), each(1.0, 3)),
     )
+
+
+def reading_errors(result: CalibrationResult, data: dc.Readings, stage: str = STAGES[-1]) -> Tensor:
+    """Readings of the only kind of a calibration as of a stage, measured minus predicted (N, r), m at the ball."""
+    (devices,) = result.places(stage).devices.values()
+    return devices.errors(data, devices.points_of(result.stages[stage](data.q).detach()))

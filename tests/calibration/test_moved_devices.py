@@ -104,11 +104,11 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
     assert all(what in text for what in ("the measuring device", "a marker", "near row 50"))
 
 
-def told(arm: SimulatedArm, q: Tensor, points: Tensor) -> str | None:
-    """What is said of changes in these rows, with scales given."""
+def told(arm: SimulatedArm, q: Tensor, points: Tensor, *, given: bool = True) -> str | None:
+    """What is said of changes in these rows, with scales given or selected."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales())
+        dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales() if given else None)
     texts = [str(one.message) for one in caught]
     return next((text for text in texts if "seems to" in text), None)
 
@@ -141,6 +141,18 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
     assert found is not None, drift
     assert float(found[1]) == pytest.approx(0.5, rel=0.2)
     assert told(arm, q, points) is None
+
+
+@pytest.mark.slow
+def test_three_set_ups_are_no_drift() -> None:
+    arm = SimulatedArm(3)
+    q, points = arm.measure(90, seed=1)
+    steps = (torch.arange(90, dtype=torch.float64) // 30)[:, None, None]
+    text = told(arm, q, points + 4e-4 * steps * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64), given=False)
+    assert text is not None
+    found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
+    assert found is not None, text
+    assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)
 
 
 def test_the_chance_of_a_jump_is_that_of_white_noise() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import random
 import signal
@@ -131,6 +132,25 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
     assert command(*words, "--target", "50mm").code == 0
+
+
+def test_rows_that_are_there_before_are_judged_as_with_once(
+    tmp_path: Path, lines: list[str], command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also without a row that comes later; a line that cannot be read is named by its place in the table."""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
+    wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
+    (tmp_path / "run.csv").write_text("".join([*lines[:18], wrong, *lines[18:20], "x" + lines[20]]))
+    accepted = []
+    for how in ("--once", "--stdin"):
+        done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
+        assert done.code == 0
+        assert "row 17 looks wrong" in done.out
+        assert "mm expected" in done.out
+        assert "run.csv', line 22" in done.out
+        accepted.append((tmp_path / "accepted.csv").read_text())
+        (tmp_path / "run.csv.journal").unlink()
+    assert accepted[0] == accepted[1]
 
 
 @pytest.mark.slow

@@ -54,6 +54,17 @@ def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign) -> 
     assert late < 0.5 * early
 
 
+def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[:24].clone() for part in measured)
+    y[20] += 50 * MM
+    candidates = ARM.sample(20, seed=8)
+    campaign = dc.Campaign(ARM.nominal, candidates=candidates, target=candidates, background=True)
+    campaign.add(q, y)
+    campaign.wait()
+    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
+    assert [one.row for one in campaign.verdicts if not one.accepted] == [20]
+
+
 def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     campaign = copy.deepcopy(running)
     campaign.reject(5)

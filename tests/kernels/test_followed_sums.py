@@ -79,13 +79,40 @@ class Parametric(Profile):
         return (-(r2 * self.alpha)).exp() * (-self.alpha) ** order
 
 
+class Hidden(Parametric):
+    """A parameter that is no attribute."""
+
+    def __init__(self, alpha: Tensor) -> None:
+        self.where = [alpha]
+
+    @property
+    def alpha(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.where[0]
+
+
 @torch_backends
+def test_a_parameter_of_a_profile_under_torch_func(backend: Backend) -> None:
+    def energy(alpha: Tensor) -> Tensor:
+        return (A * RadialKernel(Hidden(alpha)).using(backend).field(None, Q, A)).sum()
+
+    def expected(alpha: Tensor) -> Tensor:
+        return (A * ((-squared_distances(Q, Q) * alpha).exp() @ A)).sum()
+
+    alpha = torch.tensor([0.3, 0.8], dtype=torch.float64)
+    for transform in (torch.vmap, lambda f: torch.vmap(torch.func.grad(f))):
+        torch.testing.assert_close(transform(energy)(alpha), transform(expected)(alpha), rtol=1e-10, atol=1e-10)
+
+
+@torch_backends
+@pytest.mark.parametrize("kind", [Parametric, Hidden])
 @pytest.mark.parametrize("points_too", [False, True])
 @pytest.mark.parametrize("accuracy", [None, 1e-3])
-def test_a_parameter_of_a_profile_has_a_gradient(backend: Backend, points_too: bool, accuracy: float | None) -> None:
+def test_a_parameter_of_a_profile_has_a_gradient(
+    backend: Backend, kind: type[Parametric], points_too: bool, accuracy: float | None
+) -> None:
     alpha = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     q, c = normal(150, 3, seed=1).requires_grad_(points_too), normal(150, 3, seed=2)
-    value = (c * RadialKernel(Parametric(alpha)).using(backend, accuracy).field(None, q, c)).sum()
+    value = (c * RadialKernel(kind(alpha)).using(backend, accuracy).field(None, q, c)).sum()
     expected = (c * ((-squared_distances(q, q) * alpha).exp() @ c)).sum()
     wanted = (alpha, q) if points_too else (alpha,)
     for one, other in zip(torch.autograd.grad(value, wanted), torch.autograd.grad(expected, wanted), strict=True):

@@ -296,16 +296,15 @@ def test_a_process_forked_while_a_thread_compiles_can_compile() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_many_rows_of_few_columns_run_in_a_few_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part for every tile would take longer to hand to a thread than to compute."""
+def test_many_rows_of_few_columns_make_few_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small tiles would take longer to hand to a thread than to compute."""
     parts: list[int] = []
     in_parallel = sums.in_parallel
     monkeypatch.setattr(sums, "in_parallel", lambda f, p: parts.append(len(p)) or in_parallel(f, p))
-    i, j = points(1000, 1), points(sums.LARGE_PAIRS // 1000 + 1, 2)
+    i, j = points(sums.LARGE_PAIRS // 100 + 1, 1), points(100, 2)
     assert_same(fused(FIELD, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-11)
-    fused(FIELD, GaussianProfile(), j, i)
-    assert len(parts) == 2
-    assert max(parts) <= sums.PARTS
+    assert len(parts) == 1
+    assert parts[0] <= sums.SHARED_PARTS
 
 
 def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
-from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import skew
@@ -26,8 +25,8 @@ FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""
 WORTH = 0.97
 """Part of the RMS leave-one-out error that may remain at most with the drift in the model."""
-SURE = 2.0
-"""Standard deviations from which an unknown is reported."""
+SURE, NAMED = 2.0, 3.0
+"""Standard deviations from which a gain in squared errors is no chance, and from which an unknown is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,12 +128,12 @@ class Drift(DeviceSet):
             return
         u, sd = self.size_by_column[column], self.deviations[column]
         for part, what, unit in ((slice(0, 3), "shift", "mm"), (slice(3, 6), "turn", "mrad")):
-            if float((u[part] / sd[part]).abs().max()) > SURE:
+            if float((u[part] / sd[part]).abs().max()) > NAMED:
                 yield f"the measuring frame by a {what} of {1e3 * float(u[part].norm()):.2g} {unit}"
-        if float(u[6].abs()) > SURE * float(sd[6]):
+        if float(u[6].abs()) > NAMED * float(sd[6]):
             yield f"lengths by {1e6 * float(u[6]):+.2g} ppm"
         for (name, turns), own, deviation in zip(self.joints, u[7:].tolist(), sd[7:].tolist(), strict=True):
-            if abs(own) > SURE * deviation:
+            if abs(own) > NAMED * deviation:
                 yield f"the offset of {name} by {1e3 * own:+.2g} +- {1e3 * deviation:.1g} {'mrad' if turns else 'mm'}"
 
     def entry(self) -> dict[str, object]:
@@ -144,6 +143,8 @@ class Drift(DeviceSet):
 
 
 def worth_it(before: LeaveOneOut, after: LeaveOneOut) -> bool:
-    """Whether rows that are left out prove a drift."""
-    first, second = (float(known(one.errors).square().mean()) for one in (before, after))
-    return second < WORTH**2 * first
+    """Whether rows that are left out prove a drift: most of them, and not a few large errors."""
+    first, second = (one.errors.square().nansum(1) for one in (before, after))
+    gain = first - second
+    sure = float(gain.mean()) > SURE * float(gain.std()) / len(gain) ** 0.5
+    return sure and float(second.mean()) < WORTH**2 * float(first.mean())

@@ -16,12 +16,14 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
+from diffeo_calib.calibration.diagnostics.labels import MOST_MASSES, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
+from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherRows, Placement, seen_rows
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, seen_rows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -30,7 +32,7 @@ from diffeo_calib.calibration.placing.readings import (
     with_ball_of,
     with_freed_devices,
 )
-from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -221,6 +223,21 @@ class Placed:
         seen = seen_rows(data)
         return replace(data, shared=self.placement.shared(seen), held=held)
 
+    def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
+        """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
+        own = self.coordinates
+        if own is None or not wrong:
+            return None
+        table, flags = own.table, torch.zeros(len(self.data), dtype=torch.bool, device=own.rows.device)
+        flags[[one.row for one in wrong]] = True
+        seen = model.at_payloads(table.payload)(table.q).detach()
+        labels = [label for one in self.placement for label in one.labels(own, seen)]
+        masses = table.masses.unique().tolist()
+        for mass in masses if len(masses) <= MOST_MASSES else ():
+            away = model.with_payload(mass)(table.q).detach() - table.points
+            labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
+        return label_text((seen - table.points).norm(dim=-1).nanmean(1), flags[own.rows], table.line_numbers, labels)
+
     def drifting(self) -> Placed | None:
         """The same with what may drift with columns of the table; None without such columns."""
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
@@ -307,7 +324,7 @@ def _by_coordinates(
     """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
     count = len(data)
     own.table.check_every_marker_seen()
-    sessions, table = SessionFrames.of_table(robot, own, count, progress)
+    sessions, table = Sessions.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))

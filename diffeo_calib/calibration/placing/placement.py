@@ -52,6 +52,18 @@ def seen_rows(data: Any) -> SeenRows:
     return SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
 
 
+class OtherLabel(NamedTuple):
+    """How M rows would err with another label than theirs.
+
+    Args:
+        name: in words. applies: (M,) boolean, the rows that do not have it. errors: (M,) m.
+    """
+
+    name: str
+    applies: Tensor
+    errors: Tensor
+
+
 class OtherRows(NamedTuple):
     """Rows of devices that are known, as they were measured.
 
@@ -123,6 +135,10 @@ class DeviceSet(ABC):
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
+
+    def labels(self, own: Coordinates, seen: Tensor) -> Iterable[OtherLabel]:
+        """How rows that tell coordinates would err under other names of devices; ``seen`` (N, P, 3) by the model, m."""
+        return ()
 
     def changes(self, data: SeenRows) -> Iterable[Cause]:
         """What of these devices may change during the measurements, with its effects (N, R, U) on all rows."""

@@ -1,63 +1,77 @@
-"""Campaigns in several set-ups: the device, or the robot's foot, has moved between some rows and others.
+"""Campaigns in several set-ups: the device, or the robot's foot, has moved between some rows and others, or markers.
 
 Every session has its own measuring frame, T_s from that of the largest session (the reference) to its own. The frames
 are found with a geometric calibration, all rows are brought into the frame of the reference, and what is left of the
 differences is fitted with everything else: each session but the reference has six shifts and turns of its frame and
-three shifts of every marker (a tool that was mounted again), which its rows share, as noise with a prior.
+three shifts of every marker (a tool that was mounted again), which its rows share, as noise with a prior. Where the
+device stayed, and the markers alone were mounted anew, their shifts are found in place of the frames.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, SeenRows, Settled
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, listed
+from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-from diffeo_calib.sensors.places import SESSION, PlacedDevices, check_rows_of_sessions, robust_fit
+from diffeo_calib.sensors.places import (
+    MOUNTING,
+    SESSION,
+    MountedMarkers,
+    PlacedDevices,
+    mounted_sentences,
+    place_sessions,
+    sessions_of,
+)
 from diffeo_calib.sensors.tables import Coordinates, measured_rows
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 ROUNDS = 3
+TOLD_APART = 0.5
+"""Ratio of median residuals below which one account of what differs between sessions is clearly better."""
 
 
 @dataclass(frozen=True, eq=False)
-class SessionFrames(DeviceSet):
-    """Where the measuring frames of the sessions are.
+class Sessions(DeviceSet):
+    """What differs between the rows of some sessions: measuring frames, or where markers sit.
 
     Args:
         names: of the sessions.
-        reference: the one whose frame is that of the model.
-        transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
+        reference: the one whose frame and markers are those of the model.
         session: (N,) number of the session of each row of a calibration, -1 for rows of none.
         markers: P that a device saw, the first ones of the geometry.
-        centre: (3,) about which frames turn, m; by default the middle of the rows.
     """
 
     names: tuple[str, ...]
     reference: int
-    transforms: Tensor
     session: Tensor
     markers: int
-    centre: Tensor | None = None
 
     @classmethod
     def of_table(
         cls, robot: Tree, own: Coordinates, count: int, progress: Progress
     ) -> tuple[list[DeviceSet], Measurements]:
-        """The frames of the sessions of a table of ``count`` rows, and the rows in one frame; none for one session.
+        """The sessions of a table of ``count`` rows, and the rows as those of one; none for one session.
 
         Raises:
             MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
@@ -70,60 +84,61 @@ class SessionFrames(DeviceSet):
             got = few(table.session_names)
             raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
         progress("sessions", 0, 1)
-        frames = cls.find(robot, table.device_rows())
-        return [frames.of_rows(own.rows[table.socket_numbers < 0], count)], frames.aligned(table)
+        rows = table.device_rows()
+        found = (Mountings if rows.remounted else SessionFrames).find(robot, rows)
+        if rows.lever is None:
+            _doubt(robot, rows, found)
+        return [found.of_rows(own.rows[table.socket_numbers < 0], count)], found.aligned(table)
 
     @classmethod
-    def find(cls, robot: Tree, data: Measurements) -> SessionFrames:
-        """Find the frames by geometric calibrations.
+    def find(cls, robot: Tree, data: Measurements) -> Self:
+        """Find what differs by geometric calibrations.
 
         Raises:
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
-        session, names = _sessions(data)
-        reference = reference_of(data)
+        session, reference = sessions_of(data)[1], reference_of(data)
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
-        found = cls.around(data, geometry.points(data.q), reference)
-        for _ in range(ROUNDS - 1):  # a better geometry gives better frames
+        found = cls.around(data, geometry, reference)
+        for _ in range(ROUNDS - 1):  # a better geometry gives better places
             together = found.aligned(data)
             start = register(robot, together.q, together.points, marker_tips(robot, data))
             geometry = identify(start.geometry, together.q, together.points).geometry
-            transforms = _frames(geometry.points(data.q), data, session, len(names), reference)
-            found = replace(found, transforms=transforms)
+            found = cls.around(data, geometry, reference)
         return found
 
     @classmethod
-    def around(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
-        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m."""
-        session, names = _sessions(data)
-        transforms = _frames(seen, data, session, len(names), reference)
-        return cls(names, reference, transforms, session, data.markers)
+    @abstractmethod
+    def around(cls, data: Measurements, geometry: Geometry, reference: int) -> Self:
+        """The sessions of rows around a robot in the frame of the reference."""
 
-    @classmethod
+    @staticmethod
     def beside(
-        cls, own: Coordinates, device: Coordinates, seen: Tensor, count: int
+        own: Coordinates, device: Coordinates, geometry: Geometry, seen: Tensor, count: int
     ) -> tuple[list[DeviceSet], Coordinates]:
-        """The frames of new rows, and these in the frame of the largest session; none for one session.
+        """The sessions of new rows, and these as of the largest one; none for one session.
 
         Args:
             own: rows of a table of ``count`` rows. device: those of them that a device measured.
-            seen: (M, P, 3) their points as they are known in the frame of the largest session, m.
+            geometry: of the robot in the frame of the largest session. seen: (M, P, 3) their points there, m.
         """
         if len(device.table.session_names) < 2:
             return [], own
-        frames = cls.around(device.table, seen, reference_of(device.table))
-        to_reference = torch.eye(4, dtype=seen.dtype, device=HOST).repeat(len(own.table), 1, 1)
-        to_reference[device.rows] = torch.linalg.inv(frames.transforms)[frames.session]
-        moved = own._replace(table=own.table.in_frames(to_reference))
-        return [frames.of_rows(own.rows[device.rows], count)], moved
+        reference = reference_of(device.table)
+        if device.table.remounted:
+            found: Sessions = Mountings.of_points(device.table, geometry, seen, reference)
+        else:
+            found = SessionFrames.of_points(device.table, seen, reference)
+        found = found.of_rows(device.rows, len(own.table))
+        return [found.of_rows(own.rows, count)], own._replace(table=found.aligned(own.table))
 
+    @abstractmethod
     def aligned(self, data: Any) -> Any:
-        """The rows of all sessions in the frame of the reference.
+        """The rows of all sessions as those of the reference.
 
         Raises:
             MeasurementError: a session that is not known.
         """
-        return data.in_frames(torch.linalg.inv(self.transforms)[self.numbers(data)])
 
     def groups(self) -> list[tuple[str, Tensor]]:
         """See :class:`DeviceSet`."""
@@ -134,6 +149,73 @@ class SessionFrames(DeviceSet):
         """Numbers of the sessions but the reference."""
         return [number for number in range(len(self.names)) if number != self.reference]
 
+    def of_each(self, effects: Tensor) -> Tensor:
+        """Effects (N, R, c) as those of every session but the reference by itself: (N, R, c (S - 1))."""
+        session = self.session.to(effects.device)
+        return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
+
+    def by_markers(self, data: SeenRows) -> Tensor:
+        """(N, R, 3 P) effects of markers that were mounted again."""
+        tool = data.nominal.geometry.slices["tool"]
+        return PLACES.remounted_m * data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
+
+    def with_rows(self, other: OtherRows) -> Self:
+        """See :class:`DeviceSet`."""
+        session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        device = None if other.coordinates is None else measured_rows(other.coordinates.table)
+        if other.coordinates is not None and device is not None:
+            session[other.coordinates.rows[device.rows]] = self.numbers(device.table)
+        return replace(self, session=session)
+
+    def numbers(self, data: Any) -> Tensor:
+        """(N,) number here of each row's session, -1 for none; MeasurementError for a session that is not known."""
+        if data.session is None:
+            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+        names = data.device_names
+        unknown = [name for name in dict.fromkeys(names) if name and name not in self.names]
+        if unknown:
+            fix = "register the model with rows of the new set-up"
+            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
+        known = [self.names.index(name) if name else NO_SOCKET for name in names]
+        return torch.tensor(known, dtype=torch.int64, device=HOST)
+
+    def of_rows(self, rows: Tensor, count: int) -> Self:
+        """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
+        session = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        session[rows] = self.session
+        return replace(self, session=session)
+
+
+@dataclass(frozen=True, eq=False)
+class SessionFrames(Sessions):
+    """Where the measuring frames of the sessions are.
+
+    Args:
+        transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
+        centre: (3,) about which frames turn, m; by default the middle of the rows.
+    """
+
+    transforms: Tensor
+    centre: Tensor | None = None
+
+    @classmethod
+    def around(cls, data: Measurements, geometry: Geometry, reference: int) -> SessionFrames:
+        """See :class:`Sessions`."""
+        return cls.of_points(data, geometry.points(data.q), reference)
+
+    @classmethod
+    def of_points(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
+        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m."""
+        names, session = sessions_of(data)
+        transforms = place_sessions(seen, data).transforms
+        transforms[reference] = torch.eye(4, dtype=transforms.dtype, device=HOST)
+        return cls(names, reference, session, data.markers, transforms)
+
+    def aligned(self, data: Any) -> Any:
+        """See :class:`Sessions`."""
+        here = torch.eye(4, dtype=self.transforms.dtype, device=HOST)[None]  # of rows of no session
+        return data.in_frames(torch.cat([torch.linalg.inv(self.transforms), here])[self.numbers(data)])
+
     @property
     def size(self) -> int:
         """Six of each frame, and three of each marker in each session but the reference."""
@@ -141,31 +223,14 @@ class SessionFrames(DeviceSet):
 
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
-        places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
+        places = data.points.unflatten(1, (-1, 3))
         frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)) if self.centre is None else self.centre)
         frame = frame if data.slopes is None else data.slopes @ frame
-        markers = slice(tool.start, tool.start + 3 * self.markers)
-        effects = torch.cat([frame, PLACES.remounted_m * data.sensitivities[..., markers]], dim=2)
-        session = self.session.to(effects.device)
-        return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
+        return self.of_each(torch.cat([frame, self.by_markers(data)], dim=2))
 
     def with_rows(self, other: OtherRows) -> SessionFrames:
         """See :class:`DeviceSet`."""
-        session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        device = None if other.coordinates is None else measured_rows(other.coordinates.table)
-        if other.coordinates is not None and device is not None:
-            session[other.coordinates.rows[device.rows]] = self.numbers(device.table)
-        return replace(self, session=session, centre=other.centre)
-
-    def numbers(self, data: Any) -> Tensor:
-        """(N,) number here of each row's session; MeasurementError for a session that is not known."""
-        own, names = _sessions(data)
-        unknown = [names[number] for number in own.unique().tolist() if names[number] not in self.names]
-        if unknown:
-            fix = "register the model with rows of the new set-up"
-            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        known = [self.names.index(name) if name in self.names else NO_SOCKET for name in names]
-        return torch.tensor(known, dtype=torch.int64, device=HOST)[own]
+        return replace(super().with_rows(other), centre=other.centre)
 
     def settled(self, found: Settled) -> SessionFrames:
         """See :class:`DeviceSet`."""
@@ -178,6 +243,15 @@ class SessionFrames(DeviceSet):
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
 
+    def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
+        """See :class:`DeviceSet`."""
+        session, points, count = self.session[own.rows], own.table.points, self.markers
+        for number, name in enumerate(self.names):
+            T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
+            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - seen[:, :count]
+            applies = (session != number) & (session != NO_SOCKET)
+            yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
+
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""
         rows = (self.session != NO_SOCKET).nonzero()[:, 0]
@@ -187,12 +261,6 @@ class SessionFrames(DeviceSet):
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
         return {"sessions": dict(zip(self.names, self.transforms.tolist(), strict=True))}
-
-    def of_rows(self, rows: Tensor, count: int) -> SessionFrames:
-        """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
-        session = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        session[rows] = self.session
-        return replace(self, session=session)
 
     def sentences(self) -> list[str]:
         """How far every other session's frame is from that of the reference."""
@@ -208,24 +276,90 @@ class SessionFrames(DeviceSet):
         return lines
 
 
+@dataclass(frozen=True, eq=False)
+class Mountings(Sessions):
+    """Where markers sit that were mounted anew in each session, in one measuring frame.
+
+    Args:
+        mounted: the sessions and their markers.
+    """
+
+    mounted: MountedMarkers
+
+    @classmethod
+    def around(cls, data: Measurements, geometry: Geometry, reference: int) -> Mountings:
+        """See :class:`Sessions`."""
+        return cls.of_points(data, geometry, geometry.points(data.q), reference)
+
+    @classmethod
+    def of_points(cls, data: Measurements, geometry: Geometry, seen: Tensor, reference: int) -> Mountings:
+        """The markers of rows whose points (N, P, 3) are known with the markers of the reference, m."""
+        found = MountedMarkers.of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
+        other = torch.arange(len(found.names), device=HOST)[:, None, None] != reference
+        found = replace(found, shifts=found.shifts * other, deviations=found.deviations * other, new=())
+        return cls(found.names, reference, sessions_of(data)[1], found.shifts.shape[1], found)
+
+    def aligned(self, data: Any) -> Any:
+        """See :class:`Sessions`."""
+        self.numbers(data)
+        return self.mounted.aligned(data)
+
+    @property
+    def size(self) -> int:
+        """Three of each marker in each session but the reference."""
+        return len(self.others) * 3 * self.markers
+
+    def effects(self, data: SeenRows) -> Tensor:
+        """See :class:`DeviceSet`: what is left of the places of the markers."""
+        return self.of_each(self.by_markers(data))
+
+    def settled(self, found: Settled) -> Mountings:
+        """See :class:`DeviceSet`."""
+        shifts, deviations = self.mounted.shifts.clone(), self.mounted.deviations.clone()
+        shape = len(self.others), -1, 3
+        shifts[self.others] += PLACES.remounted_m * found.shifts.view(shape)
+        deviations[self.others] = PLACES.remounted_m * found.covariance.diagonal().clamp(min=0).sqrt().view(shape)
+        return replace(self, mounted=replace(self.mounted, shifts=shifts, deviations=deviations))
+
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
+        values = self.mounted.shifts.flatten(1), self.mounted.deviations.flatten(1)
+        return PlacedDevices(MOUNTING, self.names, *values, rows, self.session[rows])
+
+    def entry(self) -> dict[str, object]:
+        """See :class:`DeviceSet`."""
+        return {"mountings": dict(zip(self.names, self.mounted.shifts.tolist(), strict=True))}
+
+    def sentences(self) -> list[str]:
+        """How far the markers of every other session are from those of the reference."""
+        return mounted_sentences(self.names, self.mounted.shifts, self.mounted.deviations)
+
+
+def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:
+    """Warn where rows fit far better if the markers were mounted anew and the device stayed, or the other way round."""
+    with suppress(MeasurementError):
+        other = (SessionFrames if data.remounted else Mountings).find(robot, data)
+        ratio = _largest_median(robot, data, other) / _largest_median(robot, data, found)
+        if ratio < TOLD_APART:
+            moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
+            what, stayed = moved[data.remounted]
+            words = f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
+            option = "leave out" if data.remounted else "add"
+            fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
+            warn_user(sentence(words, fix=fix))
+
+
+def _largest_median(robot: Tree, data: Measurements, sessions: Sessions) -> float:
+    """Median distance of a session's rows from the geometric calibration of all, m: that of the worst session."""
+    points = sessions.aligned(data).points
+    start = register(robot, data.q, points, marker_tips(robot, data))
+    away = (identify(start.geometry, data.q, points).geometry.points(data.q) - points).norm(dim=2)
+    numbers = sessions.numbers(data)
+    return max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())
+
+
 def reference_of(data: Measurements) -> int:
     """Number of the largest session; MeasurementError for a session with too few rows."""
-    session, names = _sessions(data)
-    check_rows_of_sessions(session, names)
-    return int(torch.bincount(session, minlength=len(names)).argmax())
-
-
-def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:
-    if data.session is None:
-        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-    return data.session, data.session_names
-
-
-def _frames(seen: Tensor, data: Measurements, session: Tensor, count: int, reference: int) -> Tensor:
-    """Rigid fits of every session's rows to the robot in the frame of the reference, without gross outliers."""
-    found = torch.eye(4, dtype=data.points.dtype, device=HOST).repeat(count, 1, 1)
-    for number in range(count):
-        if number != reference:
-            own = session == number
-            found[number] = robust_fit(seen[own], data.points[own])
-    return found
+    names, session = sessions_of(data)
+    return int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())

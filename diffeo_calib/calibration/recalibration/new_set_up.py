@@ -15,7 +15,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet
 from diffeo_calib.calibration.placing.readings import ball_of
-from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
@@ -31,6 +31,7 @@ from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.tables import (
@@ -136,7 +137,8 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
         device = measured_rows(own.table)
         if device is not None:
             place, seen = _place_of_device(old, nominal, model.lever, device.table)
-            sessions, own = SessionFrames.beside(own, device, seen, len(new))
+            geometry = _in_frame(old, nominal, place.registration.transform)
+            sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
 
@@ -175,11 +177,17 @@ def _place_of_device(
     return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
+def _in_frame(old: FittedMap, nominal: GeometryMap, T: Tensor) -> Geometry:
+    """The geometry of the old map without deformation, in a frame seen from its own by T (4, 4), m."""
+    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+    return replace(geometry, base=T @ geometry.base)
+
+
 def _ball(
     old: FittedMap, nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]
 ) -> Tensor | None:
     """(3,) where new rows put a ball on its tip, if the joints are as the old map says without deformation, m."""
-    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+    geometry = _in_frame(old, nominal, torch.eye(4, dtype=nominal.geometry.base.dtype, device=HOST))
     ball = None if own is None else ball_in_sockets(own.table, geometry)
     if ball is not None:
         return ball

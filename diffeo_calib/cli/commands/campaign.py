@@ -43,7 +43,7 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     goal = Goal(None if limit is None else limit.value, given.next, given.json_lines)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
-        campaign = Campaign(robot, candidates=candidates, background=not given.once)
+        campaign = Campaign(robot, candidates=candidates)
         live = Live(campaign, source, links.tips, journal, goal)
         live.resume()
         inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
@@ -85,13 +85,14 @@ def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
     while True:
         lines = live.new_lines()
         live.judge(lines)
+        live.campaign.background = not given.once  # rows that were there before are judged one after the other
         yield bool(lines)
         if given.once and not lines:
             return
         try:
             sent = inbox.get(timeout=LOOK_SECONDS)
         except Empty:
-            yield live.campaign.poll()
+            yield live.poll()
             continue
         if sent is not None:
             live.take(sent)

@@ -20,7 +20,7 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
-from diffeo_calib.interop.files import angles, lengths, origin_numbers
+from diffeo_calib.interop.files import in_unit, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
 from diffeo_calib.interop.rigid import (
     RigidKinematics,
@@ -259,8 +259,8 @@ def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
 
 def _place(transform: Tensor, given: Export) -> str:
     xyz, rpy = origin_numbers(transform)
-    place = " ".join(f"{value:.6g}" for value in lengths(xyz, given.length.value))
-    turn = " ".join(f"{value:.6g}" for value in angles(rpy, given.angle.value))
+    place = " ".join(f"{value:.6g}" for value in in_unit(xyz, given.length.value))
+    turn = " ".join(f"{value:.6g}" for value in in_unit(rpy, given.angle.value))
     return f"{place} {given.length.value}, {turn} {given.angle.value}"
 
 

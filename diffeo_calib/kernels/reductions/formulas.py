@@ -199,13 +199,6 @@ class Unknown:
     __eq__ = __ne__ = __bool__ = _refuse
 
 
-def constant(value: Any) -> float:
-    """A number that a symbol is combined with; TypeError for a tensor that autograd follows, and for what is none."""
-    if torch.is_grad_enabled() and getattr(value, "requires_grad", False):
-        raise TypeError("a pairwise symbol: expected constants, got a tensor that requires gradients")
-    return float(value)
-
-
 class MatrixPairs:
     """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd."""
 

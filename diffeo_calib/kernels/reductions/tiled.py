@@ -30,7 +30,6 @@ from diffeo_calib.kernels.reductions.formulas import (
     MatrixPairs,
     Points,
     Unknown,
-    constant,
     distance_change_factors,
     distance_factors,
     weighted_sums,
@@ -304,7 +303,7 @@ class Symbol(Unknown):
 
     def __mul__(self, other: Symbol | float) -> Symbol:
         if not isinstance(other, Symbol):
-            return Symbol(self.pool, self.scale * constant(other), self._matrix, self._factors)
+            return Symbol(self.pool, self.scale * float(other), self._matrix, self._factors)
         a = self._evaluated().values
         b, out = other._fresh()
         torch.mul(a, b, out=out.values)
@@ -317,7 +316,7 @@ class Symbol(Unknown):
         if isinstance(other, Symbol):
             torch.add(a, other.matrix, alpha=other.scale / self.scale, out=out.values)
         else:
-            torch.add(a, constant(other) / self.scale, out=out.values)
+            torch.add(a, float(other) / self.scale, out=out.values)
         return Symbol(self.pool, self.scale, out)
 
     def __truediv__(self, other: Symbol | float) -> Symbol:

@@ -154,7 +154,7 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
     found = {own.kind: own for own in model.placement}
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
-        for own in sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach()):
+        for own in sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach(), model.turns):
             found[own.kind] = own.beside(found[own.kind]) if own.kind in found else own
     return tuple(found.values())
 

@@ -27,7 +27,7 @@ known, and turning the tool determines it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import degrees
@@ -37,7 +37,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
@@ -157,22 +157,14 @@ class RegisteredMap(FittedMap):
         """The same map on a device, where its inputs must be too."""
         return RegisteredMap(self.fitted.to(device), self.registration)
 
-    def posterior(
-        self, x: Tensor, *, noise: bool = True, directions: Callable[[Tensor], Tensor] | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Mean and covariance, that of the registration included; arguments as :meth:`FittedMap.posterior`."""
-        means, blocks = [], []
-        for first in range(0, max(len(x), 1), PREDICT_ROWS):
-            some = slice(first, first + PREDICT_ROWS)
-            rows, geodesic = x[some], self.geodesic.at_rows(some)
-            mean, at = geodesic.linearised_value(rows)
-            added = self._added(at, marker_slopes(geodesic, self.points.rows(some), rows))
-            if noise:
-                added = added + self.new_noise
-            wanted = None if directions is None else directions(mean)
-            means.append(mean)
-            blocks.append(self.fitted.with_second_order(self.fitted.covariance_at(at, wanted)) + _along(wanted, added))
-        return torch.cat(means), torch.cat(blocks)
+    def _covariance(
+        self, geodesic: GeodesicDeformation, rows: Tensor, at: Linearisation, directions: Tensor | None
+    ) -> Tensor:
+        """That of the fit and of the registration."""
+        points: Any = geodesic.spec.nominal
+        added = self._added(at, marker_slopes(geodesic, points, rows))
+        fitted = self.fitted.with_second_order(self.fitted.covariance_at(at, directions))
+        return fitted + _along(directions, added)
 
     def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Covariance of points of the body whose places on the flange are given; as :meth:`FittedMap.covariance_at`."""

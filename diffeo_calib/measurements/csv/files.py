@@ -109,10 +109,13 @@ def _check_options(columns: TableColumns, table: TableFormat) -> None:
     if not columns.sensors:
         fix = "name the columns of the marker, or those of `socket`"
         raise MeasurementError.of("`position` is missing", fix=fix)
+    if table.remounted and columns.session is None:
+        raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
     if columns.position is not None:
         return
     given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
-    given |= {"camera_on_tool": table.camera_on_tool or None, "session": columns.session}
+    given |= {"camera_on_tool": table.camera_on_tool or None, "remounted": table.remounted or None}
+    given |= {"session": columns.session}
     names = [f"`{name}`" for name, value in given.items() if value is not None]
     if names:
         beside = "socket" if columns.sockets is not None else "readings"
@@ -176,6 +179,7 @@ def read_measurements(
     on: Sequence[str] | None = None,
     camera_on_tool: bool = False,
     session: str | None = None,
+    remounted: bool = False,
     socket: Sequence[str] | str | None = None,
     distances: Distances | None = None,
     distance_std: float | None = None,
@@ -215,6 +219,7 @@ def read_measurements(
             For another link see :meth:`Measurements.with_payload`.
         time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
+        remounted: whether the markers were mounted anew between these instead, see there.
         camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
             deviations are along its axes; see :meth:`Measurements.from_poses`.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
@@ -236,7 +241,7 @@ def read_measurements(
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
-    table = replace(table, camera_on_tool=camera_on_tool, time=time, temperature=temperature)
+    table = replace(table, camera_on_tool=camera_on_tool, remounted=remounted, time=time, temperature=temperature)
     if socket is None and (distances is not None or distance_std is not None):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     tip = None if not on or isinstance(on, str) else on[-1]

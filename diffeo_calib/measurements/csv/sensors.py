@@ -101,7 +101,7 @@ class PositionColumns(OneLineEach):
     def table(self, rows: FileRows) -> Measurements:
         """See :class:`SensorColumns`."""
         data = to_measurements(rows.cells.path, rows.values, rows.lines, rows.columns).with_tips(self.on)
-        return data.with_sessions(rows.names(self.session, "a name"))
+        return data.with_sessions(rows.names(self.session, "a name"), remounted=rows.columns.table.remounted)
 
 
 @dataclass(frozen=True)

@@ -309,7 +309,7 @@ class _Sheet:
         _check_held(device, whole, table, position)
         if device is not None:
             triples = position_triples(position or device.position_names)
-            table = _with_names(device, table, triples)
+            table = replace(_with_names(device, table, triples), remounted=device.remounted)
         if whole.payload is not None and table.payload is None:
             table = replace(table, payload=PAYLOAD)
         table = replace(table, **{name: getattr(table, name) or name for name in whole.covariate_names})

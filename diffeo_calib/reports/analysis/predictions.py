@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.table import Measurements
@@ -82,24 +82,18 @@ class Predictions:
 
     def found_shares(self) -> Tensor:
         """Shares of errors inside the regions that claim :data:`SHARES`."""
-        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
-        limits = torch.from_numpy(chi2.ppf(SHARES.numpy(), 3))
+        limits = SHARES.new_tensor([chi2_above(1.0 - share, 3) for share in SHARES.tolist()])
         return (known(self.squares)[:, None] <= limits).double().mean(0)
 
     def coverage(self, share: float = 0.95) -> float:
         """Share of errors inside the regions that claim ``share``."""
-        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
-        return float((known(self.squares) <= float(chi2.ppf(share, 3))).double().mean())
+        return float((known(self.squares) <= chi2_above(1.0 - share, 3)).double().mean())
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
-        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
         squares = self.squares
-        size = max(1.0, float(squares.nanmedian()) / float(chi2.median(3)))
-        limit = size * float(chi2.isf(FALSE_ALARM_PROBABILITY / len(known(squares)), 3))
+        size = max(1.0, float(squares.nanmedian()) / chi2_median(3))
+        limit = size * chi2_above(FALSE_ALARM_PROBABILITY / len(known(squares)), 3)
         return found_outliers(model, self.data, squares > limit, self.errors.errors)
 
 

@@ -1,9 +1,8 @@
 """Kernel sums in one compiled loop that stores nothing per pair; see the table in backends.py.
 
-Formulas and profiles are those of all backends, compiled for this processor at first use: 0.1 s for each formula,
-profile and number of coordinates, once per machine. Needs the package llvmlite, and no C compiler.
-
-LLVM code compiled for this processor, by llvmlite, and kept on disk.
+Formulas and profiles are those of all backends, compiled for this processor by LLVM at first use: 0.1 s for each
+formula, profile and number of coordinates, once per machine, since the code is kept on disk. Needs the package
+llvmlite, and no C compiler.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
-from diffeo_calib.kernels.profiles import PROFILES, Profile
+from diffeo_calib.kernels.profiles import SHIPPED, Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program, SymbolicPairs
 from diffeo_calib.kernels.reductions.fused.symbols import Code, Vector
 from diffeo_calib.kernels.reductions.keops import cache_folder
-from diffeo_calib.kernels.reductions.tiled import dealt
+from diffeo_calib.kernels.reductions.tiled import LARGE_PAIRS, PARTS, SHARED_PARTS, dealt
 
 DIGEST = hashlib.sha256().digest_size
 LOCK = RLock()
@@ -131,10 +130,6 @@ def _kept(mark: str) -> bytes | None:
 Chosen = Callable[[Sequence[Any]], list[Any]]
 REALS = {torch.float64: ("double", 8), torch.float32: ("float", 4)}
 """Types of points: their names, and bytes of a number."""
-LARGE_PAIRS = 1 << 22
-"""Pairs from which a sum runs in several threads."""
-PARTS = 16
-"""Parts of such a sum, whatever the number of threads, so that the result is the same to the last digit."""
 TILE_BYTES = 20 << 10
 """Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
 CACHE_LINE = 64
@@ -148,8 +143,6 @@ MOST_INPUTS = 64
 MOST_VARIANTS = 64
 """Sums with profiles of one class of the user's that are compiled. With more, a parameter is being optimised, and
 compiling takes too long."""
-SHIPPED = {type(profile) for profile in PROFILES.values()}
-"""Classes of profiles that always compute the same."""
 
 
 class _Lines(NamedTuple):
@@ -200,15 +193,16 @@ class Compiled(NamedTuple):
                 return self._over_pairs(right, side, tiles)
             return reduce(Tensor.add_, in_parallel(lambda t: self._over_pairs(right, side, t), dealt(tiles, PARTS)))
         left = _Lines.of(rows, self.program)
-        totals, tiles = self._zeros(left), mine(range(-(-left.count // side)))
+        # many rows of few columns: not so many tiles that handing them to threads takes longer than the sums
+        height = max(side, -(-left.count // (SHARED_PARTS * MOST_GROUP)) * MOST_GROUP)
+        totals, tiles = self._zeros(left), mine(range(-(-left.count // height)))
         columns_ = (right.values.data_ptr(), right.count, right.length)
 
-        def part(tiles: list[int]) -> None:
-            for first in (tile * side for tile in tiles):
-                last = min(first + side, left.count)
-                self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
+        def part(tile: int) -> None:
+            first, last = tile * height, min((tile + 1) * height, left.count)
+            self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
 
-        for _ in in_parallel(part, dealt(tiles, PARTS if large else 1)):
+        for _ in in_parallel(part, tiles) if large else map(part, tiles):
             pass
         return totals
 

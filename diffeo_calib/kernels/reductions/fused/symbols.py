@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from math import inf, log
 from typing import Any
 
-from diffeo_calib.kernels.reductions.formulas import Unknown, constant
+from diffeo_calib.kernels.reductions.formulas import Unknown
 
 MOST_FACTORS = 8
 """Of a power in a profile."""
@@ -151,7 +151,7 @@ class Symbol(Unknown):
 
     def __mul__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            number = constant(other)
+            number = float(other)
             return Symbol(self.code, self.value if number else None, self.scale * number, self.positive)
         if self.value is None or other.value is None:
             one = self if other.value is None else other
@@ -162,7 +162,7 @@ class Symbol(Unknown):
 
     def __add__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            other = Symbol(self.code, None, constant(other))
+            other = Symbol(self.code, None, float(other))
         if self.value is None and other.value is None:
             return Symbol(self.code, None, self.scale + other.scale)
         if self.value is None or self.scale == 0.0:
@@ -189,7 +189,7 @@ class Symbol(Unknown):
 
     def __truediv__(self, other: Any) -> Symbol:
         if not isinstance(other, Symbol):
-            return self * (1.0 / constant(other))
+            return self * (1.0 / float(other))
         if other.value is None:
             return self * (1.0 / other.scale)
         above = self.value or self.code.constant(1.0)
@@ -198,7 +198,7 @@ class Symbol(Unknown):
         return Symbol(self.code, ratio, self.scale / other.scale, positive)
 
     def __rtruediv__(self, other: Any) -> Symbol:
-        return Symbol(self.code, None, constant(other)) / self
+        return Symbol(self.code, None, float(other)) / self
 
     def __pow__(self, power: Any) -> Symbol:
         whole = int(power)

@@ -1,0 +1,159 @@
+"""Markers that are mounted anew between sessions of one measuring frame: found, fitted, judged, predicted, saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from kind_bank import remounted
+from product_bank import usual_scales
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import rotation, twist_transform
+
+ARM = SimulatedArm(seed=1)
+SHIFTS = torch.tensor([[0.0, 0.0, 0.0], [3e-3, 4e-3, 0.0], [0.0, -3e-3, 4e-3]], dtype=torch.float64)  # 5 mm each
+ROWS = 120
+
+
+def table(rows: int, seed: int) -> dc.Measurements:
+    return dc.Measurements(*ARM.measure(rows, seed=seed), ARM.nominal.joint_names)
+
+
+def calibrated(data: dc.Measurements) -> dc.CalibrationResult:
+    return dc.calibrate(ARM.nominal, data, hyperparameters=usual_scales(ARM.nominal))
+
+
+@pytest.fixture(scope="module")
+def result() -> dc.CalibrationResult:
+    return calibrated(remounted(ARM, table(ROWS, 1), SHIFTS))
+
+
+def true_error(model: Any) -> float:
+    q = ARM.sample(400, seed=9)
+    return float((model(q) - ARM.true_points(q)).norm(dim=-1).square().mean().sqrt())
+
+
+def test_as_accurate_as_in_one_session(result: dc.CalibrationResult) -> None:
+    assert true_error(result.model) < 1.1 * true_error(calibrated(table(ROWS, 1)).model)
+
+
+def test_the_shifts_are_found(result: dc.CalibrationResult) -> None:
+    found = result.sessions.mounted
+    order = ["abc".index(name) for name in found.names]
+    away = (found.shifts[:, 0] - SHIFTS[order]).abs()
+    assert bool((away < 5 * found.deviations[:, 0] + 1e-9).all())
+    assert float(found.deviations.max()) < 3e-5
+    assert [text.split("'")[1] for text in result.placement.sentences()] == ["b", "c"]
+    assert all("5.0" in text and " mm" in text for text in result.placement.sentences())
+
+
+def test_rows_of_known_and_of_new_sessions_are_judged(result: dc.CalibrationResult, tmp_path: Path) -> None:
+    dc.save(result.model, tmp_path / "arm.safetensors")
+    model: Any = dc.load(tmp_path / "arm.safetensors")
+    rows = table(40, 5)
+    plain, new = dc.evaluate(model, rows), remounted(ARM, rows, SHIFTS)
+    known: Any = dc.evaluate(model, new)
+    assert known.numbers == 0
+    assert known.rms < 1.2 * plain.rms
+    renamed = new.with_sessions([f"{name} again" for name in new.device_names], remounted=True)
+    placed: Any = dc.evaluate(model, renamed)
+    assert placed.numbers == 9
+    assert placed.rms < 1.2 * plain.rms
+    assert any("session 'b again': its marker is" in text for text in placed.placed)
+    alone: Any = dc.evaluate(model, new.rows(slice(1, None, 5)))  # the second session, whose name the others keep
+    assert (alone.count, alone.numbers) == (8, 0)
+    assert alone.rms < 1.5 * plain.rms
+    assert dc.evaluate(model, new.with_sessions(None)).rms > 2e-3
+    with pytest.raises(InputError, match="mounted anew"):
+        dc.evaluate(result.identification.geometry.points, new)
+
+
+def test_the_marker_of_each_session_is_predicted(result: dc.CalibrationResult) -> None:
+    """Its errors are those that are expected."""
+    q = ARM.sample(200, seed=11)
+    rows = dc.Measurements(q, ARM.true_points(q), ARM.nominal.joint_names)
+    turns = ARM.truth.marker_poses(q)[:, 0, :3, :3]
+    found = {one.device: one for one in result.model.predict_readings(q)}
+    assert set(found) == {"b", "c"}
+    for number, name in ((1, "b"), (2, "c")):
+        own = found[name]
+        assert own.unit == "mm"
+        error = own.mean - 1e3 * (rows.points[:, 0] + turns @ SHIFTS[number])
+        squares = (error[:, None] @ torch.linalg.solve(own.covariance, error[..., None])).flatten()
+        assert float((squares < 7.81).double().mean()) > 0.9
+
+
+def test_a_marker_that_a_session_hides() -> None:
+    """It is where it was, and nothing is predicted of it there."""
+    arm = SimulatedArm(seed=1, markers=2)
+    rows = remounted(arm, dc.Measurements(*arm.measure(90, seed=1), arm.nominal.joint_names), SHIFTS)
+    points, names = rows.points.clone(), rows.device_names
+    points[[name == "c" for name in names], 1] = torch.nan
+    data = dc.Measurements(rows.q, points, arm.nominal.joint_names).with_sessions(names, remounted=True)
+    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal))
+    assert [text.partition(" away")[0].count("not seen") for text in found.placement.sentences()] == [0, 1]
+    (b, c) = found.model.predict_readings(rows.q[:3])
+    assert bool(b.mean.isfinite().all())
+    assert c.mean.isnan().view(3, 2, 3).any(2).any(0).tolist() == [False, True]
+    assert dc.evaluate(found.model, data).rms < 1e-4
+
+
+def test_a_year_later(result: dc.CalibrationResult) -> None:
+    """The device stands elsewhere, and the marker was mounted anew twice more."""
+    T = twist_transform(torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64))
+    rows = remounted(ARM, table(45, 6), SHIFTS)
+    moved = rows.in_frames(T.expand(len(rows), 4, 4)).with_sessions(rows.device_names, remounted=True)
+    found = dc.recalibrate(result.model, moved)
+    assert not found.changes.found
+    for model in (found.model, result.model.registered(moved)):
+        assert dc.evaluate(model, moved).rms < 1e-4
+
+
+@pytest.mark.parametrize("said", [False, True])
+def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None:
+    """Frames are taken for markers, and markers for frames."""
+    rows = table(60, 1)
+    names = remounted(ARM, rows).device_names
+    if said:
+        T = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+        T[[name == "b" for name in names], :3, :3] = rotation(torch.tensor([2e-3, 1e-3, -2e-3], dtype=torch.float64))
+        data = rows.in_frames(T)
+    else:
+        data = remounted(ARM, rows).with_sessions(None)
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        calibrated(data.with_sessions(names, remounted=said))
+    assert sum("--remounted" in str(one.message) for one in caught) == 1
+
+
+def test_nothing_is_said_where_frames_moved(recwarn: pytest.WarningsRecorder) -> None:
+    rows = table(60, 1)
+    T = twist_transform(torch.tensor([2e-3, 0.0, 1e-3, 1e-3, 0.0, 2e-3], dtype=torch.float64))
+    first = torch.arange(60) < 35
+    both = torch.where(first[:, None, None], torch.eye(4, dtype=torch.float64), T)
+    calibrated(rows.in_frames(both).with_sessions(["ab"[int(k >= 35)] for k in range(60)]))
+    assert not [one for one in recwarn if "--remounted" in str(one.message)]
+
+
+def test_set_ups_are_named(tmp_path: Path) -> None:
+    path, columns = tmp_path / "t.csv", ["x", "y", "z"]
+    write_measurements(path, remounted(ARM, table(10, 1)), TableFormat("m", "rad"))
+    known: dict[str, Any] = {"length": "m", "angle": "rad"}
+    with pytest.raises(MeasurementError, match="`remounted` without `session`"):
+        dc.read_measurements(path, ARM.nominal, columns, remounted=True, **known)
+    same = dc.read_measurements(path, ARM.nominal, columns, remounted=True, session="session", **known)
+    assert (same.remounted, same.session_names) == (True, ("a", "b", "c"))
+
+
+def test_poses_are_refused() -> None:
+    q = ARM.sample(6, seed=1)
+    poses = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
+    data = dc.Measurements.from_poses(q, poses, ARM.nominal.joint_names, doubt=False)
+    with pytest.raises(MeasurementError, match="expected positions, got poses"):
+        data.with_sessions(list("aabbcc"), remounted=True)
