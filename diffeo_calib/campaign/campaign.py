@@ -37,6 +37,8 @@ FIRST_SCALES = 20
 """Accepted rows at which scales are selected first; then at twice as many."""
 CANDIDATES, TARGETS = 120, 40
 """Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
+SAME_POSE = 5e-3
+"""Largest difference of a joint between a pose and its repeat, rad or m."""
 
 
 @methods_outside_inference_mode
@@ -143,6 +145,10 @@ class Campaign:
         """Leave a row out, whatever its verdict."""
         self._decide(row, accepted=False)
 
+    def repeat(self, row: int) -> None:
+        """Leave a row out and put its pose first among the next, until a row is measured there."""
+        self._decide(row, accepted=False, again=True)
+
     def rows(self) -> Table:
         """The accepted rows; InputError if there are none."""
         if not self.accepted:
@@ -155,12 +161,21 @@ class Campaign:
 
     @small_work()
     def next(self, count: int = 5, goal: float | None = None) -> Next | None:
-        """The poses that help most, greedily, and how many more rows an expected error takes; None before a model.
+        """Poses to measure again, then those that help most, greedily; and how many more rows an expected error takes.
 
         Args:
             count: of poses. goal: expected error to reach, m.
+
+        Returns:
+            None before a model, unless poses are to be measured again.
         """
-        return None if self._model is None else planned(self._model, count, goal)
+        again = [one.row for one in self.verdicts if one.again][:count]
+        found = None if self._model is None else planned(self._model, count, goal)
+        if not again:
+            return found
+        found = found or Next(self.candidates[:0], [], [], None)
+        q = torch.cat([self.table.q[again], found.q])[:count]
+        return replace(found, q=q, rows=found.rows[: count - len(again)], again=again)
 
     def wait(self) -> None:
         """Wait for a model that is made in the background."""
@@ -177,12 +192,16 @@ class Campaign:
             self._judge(self._model, self.table)
         self._renew()
         self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
+        for one in self.verdicts[:row]:
+            if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
+                self.verdicts[one.row] = replace(one, again=False)
 
-    def _decide(self, row: int, *, accepted: bool) -> None:
+    def _decide(self, row: int, *, accepted: bool, again: bool = False) -> None:
         if row not in range(len(self)):
             raise InputError.of("`row`", expected=f"0 to {len(self) - 1}", got=str(row))
-        if self.verdicts[row].accepted != accepted:
-            self.verdicts[row] = replace(self.verdicts[row], accepted=accepted, decided=True)
+        before = self.verdicts[row]
+        self.verdicts[row] = replace(before, accepted=accepted, decided=True, again=again)
+        if before.accepted != accepted:
             self.wait()
             if self._model is not None:
                 self._model = self._model.rebuilt(self.table, self.verdicts)

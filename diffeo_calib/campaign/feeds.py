@@ -20,9 +20,9 @@ before the row (`row`, `cause`, `others`, `size`, `unit`, `fix`); `revised`: ear
 program sends the rows again that were not answered: a row whose id the table has is answered and not taken in again.
 
 Other objects: `{}` asks for the last six of these alone; `{"do": "reject", "row": 5}` leaves a row out, "accept" takes
-it in. A socket answers `{}` by itself when a connection begins, and says `"ended": true` when the campaign ends. Where
-it needs a token, `{"token": "..."}` is the first line. A line that is no JSON object ends its connection: browsers,
-too, can send text to local ports.
+it in, "repeat" leaves it out and puts its pose first among the next. A socket answers `{}` by itself when a connection
+begins, and says `"ended": true` when the campaign ends. Where it needs a token, `{"token": "..."}` is the first line. A
+line that is no JSON object ends its connection: browsers, too, can send text to local ports.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError
 
 MOST_BYTES = 1 << 20
 """Of a line."""
-DECISIONS = ("accept", "reject")
+DECISIONS = ("accept", "reject", "repeat")
 """What a user may do with a row: methods of a campaign."""
 LOCAL = ("127.0.0.1", "localhost")
 CLOSING_SECONDS = 2.0

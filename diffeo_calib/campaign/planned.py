@@ -6,6 +6,7 @@ measured like the last row of the campaign, whatever that was.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, log
 
@@ -24,15 +25,18 @@ class Next:
     """What to measure next.
 
     Args:
-        q: (count, n) rad or m, the most helpful first. rows: their numbers among the candidates.
+        q: (count, n) rad or m: poses to measure again, then the most helpful first.
+        rows: numbers of these among the candidates.
         expected: expected error over the target after 0, 1, ... of the best poses, m.
         needed: rows until the expected error is below the goal; None without a goal, or if none is in sight.
+        again: rows whose poses are to be measured again.
     """
 
     q: Tensor
     rows: list[int]
     expected: list[float]
     needed: int | None
+    again: Sequence[int] = ()
 
 
 def planned(model: CampaignModel, count: int, goal: float | None) -> Next:

@@ -90,7 +90,7 @@ class Verdict:
         error: how far it is from its prediction, m at the tool: RMS of its numbers. expected: the same as expected.
         cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
         expected_error: error of the robot over the target after this row, m; None before the first model.
-        decided: whether the user accepted or rejected it.
+        decided: whether the user accepted or rejected it. again: whether its pose is to be measured again.
         shown: unit in which errors of its kind are shown, and how many of it are a metre at the tool.
     """
 
@@ -104,16 +104,18 @@ class Verdict:
     expected_error: float | None = None
     decided: bool = False
     shown: tuple[str, float] = ("mm", 1e3)
+    again: bool = False
 
     def __str__(self) -> str:
+        again = "; to be measured again" * self.again
         if self.fits is None:
-            return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}"
+            return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}{again}"
         unit, per_metre = self.shown
         size = (
             f"{per_metre * self.error:.3g} {unit} from its prediction, {per_metre * self.expected:.2g} {unit} are usual"
         )
         how = "fits" if self.fits and self.change is None else "looks wrong"
-        text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}"
+        text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}{again}"
         return text if self.change is None else f"{text}; {self.change}"
 
     def entry(self) -> dict[str, Any]:

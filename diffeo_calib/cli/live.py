@@ -19,7 +19,7 @@ from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 
-KEPT = ("fits", "accepted", "error", "expected", "cause", "decided")
+KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
 """What a journal keeps of a verdict."""
 ID = "id"
 """Column that tells rows apart."""
@@ -45,8 +45,8 @@ class Live:
 
     Args:
         tips: of the markers. table: the file. owner: the line of each row. lines: all that were judged.
-        waiting: those that were there at the start and were not. said: whether each row was accepted, by the journal.
-        ids: number of the line of each id. unreadable: lines that are no rows, and why.
+        waiting: those that were there at the start and were not. ids: number of the line of each id.
+        said: whether each row is accepted, and to be repeated. unreadable: lines that are no rows, and why.
         revised: rows that the last line changed.
     """
 
@@ -59,7 +59,7 @@ class Live:
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
     waiting: list[bytes] = field(default_factory=list)
-    said: list[bool] = field(default_factory=list)
+    said: list[tuple[bool, bool]] = field(default_factory=list)
     ids: dict[str, int] = field(default_factory=dict)
     unreadable: dict[int, str] = field(default_factory=dict)
     revised: list[int] = field(default_factory=list)
@@ -96,7 +96,7 @@ class Live:
         if verdicts:
             self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
-        self.said = [one.accepted for one in self.campaign.verdicts]
+        self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
 
     def new_lines(self) -> list[bytes]:
@@ -182,8 +182,8 @@ class Live:
             self.ids[cells[header.index(ID)]] = len(self.lines) - 1
 
     def _revised(self) -> Iterator[Entry]:
-        """Entries of rows that are accepted now and were not, or the other way round."""
-        now = [one.accepted for one in self.campaign.verdicts]
+        """Entries of rows that are accepted now and were not, or the other way round; of those to be repeated, too."""
+        now = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.revised = [row for row, (one, other) in enumerate(zip(self.said, now, strict=False)) if one != other]
         self.said = now
         for row in self.revised:
@@ -221,7 +221,7 @@ class Live:
     @property
     def found(self) -> Next | None:
         """The next poses, and the forecast."""
-        now = len(self.campaign), self.campaign.models, len(self.campaign.accepted)
+        now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
             self._found = now, self.campaign.next(max(self.goal.poses, 1), self.goal.error)
         return self._found[1]
@@ -230,12 +230,11 @@ class Live:
     def words(self) -> tuple[str, str]:
         """The expected error with the rows to the goal, and the next poses."""
         state = self.state()
-        if state["expected_error_mm"] is None:
-            return "no model yet", ""
-        more = state.get("more_rows", "")
+        more, known = state.get("more_rows", ""), state["expected_error_mm"]
         needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
-        return f"{state['expected_error_mm']:.4g} mm expected{needed}", "; ".join(f"next: {pose}" for pose in poses)
+        first = "no model yet" if known is None else f"{known:.4g} mm expected{needed}"
+        return first, "; ".join(f"next: {pose}" for pose in poses)
 
     def reached(self) -> bool:
         """Whether the expected error is small enough."""

@@ -58,7 +58,7 @@ class Kernel(ABC):
             q: (N, n).
             a: (N, n); momenta (N, k, n) give k fields at once, (M, k, n).
         """
-        check_momenta(q, a)
+        check_points(x, q, a)
         x = q if x is None else x
         n = q.shape[1]
         columns = a.reshape(len(q), -1, n).mT.reshape(len(q) * n, -1)  # (N n, k)
@@ -211,8 +211,11 @@ def _warn_of_dense_sums(name: str) -> None:
     warn_user(sentence(f"{name} is a kernel of your own: its sums always use the dense matrix", fix=fix))
 
 
-def check_momenta(q: Tensor, a: Tensor) -> None:
-    """Raise InputError unless points (N, n) have momenta (N, n) or (N, k, n)."""
+def check_points(x: Tensor | None, q: Tensor, a: Tensor) -> None:
+    """Raise InputError unless points q (N, n) have momenta (N, n) or (N, k, n), and x, if given, is (M, n)."""
+    if x is not None and x.shape[-1:] != q.shape[-1:]:
+        expected = f"{q.shape[-1]} coordinates, as those of the points `q`"
+        raise InputError.of("the points `x` of a kernel sum", expected=expected, got=f"shape {tuple(x.shape)}")
     if a.shape[:1] != q.shape[:1] or a.shape[-1:] != q.shape[-1:]:
         expected = f"a row of {q.shape[-1]} numbers for each of the {len(q)} points `q`"
         raise InputError.of("the momenta `a`", expected=expected, got=f"shape {tuple(a.shape)}")

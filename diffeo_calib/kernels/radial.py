@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive, wrapped
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, check_momenta, diagonal_gram
+from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, check_points, diagonal_gram
 from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
@@ -186,7 +186,7 @@ class RadialKernel(DiagonalKernel):
 
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
-        check_momenta(q, a)
+        check_points(x, q, a)
         n, rows = q.shape[-1], (q if x is None else x).shape[0]
         if self._field_vanishes(a):
             return a.new_zeros(rows, *a.shape[1:])
@@ -198,6 +198,7 @@ class RadialKernel(DiagonalKernel):
 
     def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
+        check_points(x, q, a)
         at, n = (q if x is None else x), q.shape[-1]
         if self._field_vanishes(a):
             return torch.zeros_like(at), at.new_zeros(*at.shape, n)
@@ -209,6 +210,8 @@ class RadialKernel(DiagonalKernel):
 
     def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
+        check_points(x, q, a)
+        check_points(None, x, c)
         if self._field_vanishes(a):
             return torch.zeros_like(x), torch.zeros_like(x)
         features = self._features(x.shape[-1])
@@ -218,6 +221,7 @@ class RadialKernel(DiagonalKernel):
 
     def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a, which is v(q), and in q: (N, n) each."""
+        check_points(None, q, a)
         if self._field_vanishes(a):
             return torch.zeros_like(q), torch.zeros_like(q)
         features = self._features(q.shape[-1])
@@ -226,6 +230,8 @@ class RadialKernel(DiagonalKernel):
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of H's gradient along (dq, da): (N, n) each."""
+        check_points(None, q, a)
+        check_points(dq, q, da)
         if self.vanishes:
             return torch.zeros_like(q), torch.zeros_like(q)
         features = self._features(q.shape[-1])

@@ -158,6 +158,33 @@ def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:
     assert_close(gained[found.rows[0]], found.expected[1], rtol=0.02, atol=0.0)
 
 
+def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.Campaign) -> None:
+    campaign = copy.deepcopy(running)
+    best = campaign.next(2)
+    for row in (20, 7):
+        campaign.repeat(row)
+    assert campaign.accepted == [row for row in range(ROWS) if row not in (7, 20)]
+    found, q = campaign.next(3), running.table.q
+    assert best is not None
+    assert found is not None
+    assert_close(found.q[:2], q[[7, 20]])
+    assert (found.again, len(found.rows), len(found.q)) == ([7, 20], 1, 3)
+    campaign.add(q[20] + 1e-3, ARM.true_points(q[20:21])[0])
+    found = campaign.next(1)
+    assert found is not None
+    assert_close(found.q, q[7:8])
+    campaign.accept(7)
+    found = campaign.next(1)
+    assert found is not None
+    assert (found.again, len(found.rows)) == ((), 1)
+    early = dc.Campaign(ARM.nominal)
+    early.add(q[:2], ARM.true_points(q[:2]))
+    early.repeat(1)
+    found = early.next(1)
+    assert found is not None
+    assert_close(found.q, q[1:2])
+
+
 def test_a_thread_makes_the_same_models(measured: tuple[Tensor, Tensor]) -> None:
     campaign = dc.Campaign(ARM.nominal, background=True)
     for q, y in zip(*(part[:20] for part in measured), strict=True):

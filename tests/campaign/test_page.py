@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import http.client
 import json
 import os
 import shutil
+import tracemalloc
 from collections.abc import Iterator
 from queue import Queue
 from typing import Any
@@ -21,6 +23,12 @@ from diffeo_calib.robots import SimulatedArm
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ARM = SimulatedArm(3)
+UPDATES = int(os.environ.get("CAMPAIGN_UPDATES", "200"))
+"""3600: an hour with a row each second."""
+SHOWN = """async (text) => {
+  while (document.querySelector("#state").textContent !== text) await new Promise((done) => setTimeout(done, 3));
+}"""
+"""Waits for a state."""
 
 
 def answer(page: Page, method: str, path: str, **headers: str) -> int:
@@ -105,15 +113,20 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
     assert state_of(empty, ("no model yet", ""), None, None)["error"] is None
 
 
+def opened(running: Any) -> Any:
+    """A browser."""
+    root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
+    return running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: apt install chromium")
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
 def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, scheme: Any) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
     state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4)
-    root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
     with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
+        browser = opened(running)
         seen = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
         said: list[str] = []
         seen.on("pageerror", lambda error: said.append(str(error)))
@@ -131,12 +144,16 @@ def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, sc
         assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
         assert seen.evaluate("document.documentElement.scrollWidth <= innerWidth")
         with seen.expect_response("**/reject?**"):
-            seen.focus("button[data-row='15']")
+            seen.get_by_label("reject row 15", exact=True).focus()
             seen.keyboard.press("Enter")
         with seen.expect_response("**/accept?**"):
-            seen.focus("button[data-row='14']")
+            seen.get_by_label("accept row 14", exact=True).focus()
             seen.keyboard.press("Enter")
         assert decided(page) == [("reject", 15), ("accept", 14)]
+        for row in (9, 15):
+            with seen.expect_response("**/repeat?**"):
+                seen.get_by_label(f"repeat row {row}", exact=True).click()
+        assert decided(page) == [("repeat", 9), ("repeat", 15)]
         seen.reload()
         seen.wait_for_selector("li")
         page.publish(state | {"error": 0.123})
@@ -145,3 +162,31 @@ def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, sc
             seen.screenshot(path=f"{os.environ['CAMPAIGN_SCREENSHOT']}_{width}.png", full_page=True)
         browser.close()
     assert {urlsplit(url).netloc for url in said} == {urlsplit(page.url).netloc}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: apt install chromium")
+def test_hours_of_rows_need_no_more_memory(page: Page, campaign: dc.Campaign) -> None:
+    """Full states, one after the other: the second half leaves server and page as large as the first."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4)
+    state["curve"], state["done"] = [[row, 1 / (row + 1)] for row in range(500)], 500 * [[0.1, 0.2, 0.3]]
+    sizes = []
+    with playwright.sync_playwright() as running:
+        browser = opened(running)
+        seen = browser.new_page()
+        seen.goto(page.url)
+        session = seen.context.new_cdp_session(seen)
+        tracemalloc.start()
+        for half in range(2):
+            for update in range(UPDATES // 2):
+                page.publish(state | {"error": 100 + half, "state": str(update)})
+                seen.evaluate(SHOWN, str(update))
+            session.send("HeapProfiler.collectGarbage")
+            gc.collect()
+            sizes.append((session.send("Runtime.getHeapUsage")["usedSize"], tracemalloc.get_traced_memory()[0]))
+        tracemalloc.stop()
+        browser.close()
+    print("SIZES", sizes)
+    for name, first, second in zip(("page", "server"), *sizes, strict=True):
+        assert second < 1.1 * first + 1e5, (name, first, second)

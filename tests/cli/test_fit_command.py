@@ -152,7 +152,7 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert done.err.strip() == ""
     assert "held out │" not in done.out
     assert "no row was held out: these are errors on rows that were fitted" in done.out
-    assert re.search(r"leave-one-out RMS 0\.\d+ mm", done.out) is not None
+    assert re.search(r"leave-one-out RMS: position 0\.\d+ mm", done.out) is not None
     assert "look wrong" not in done.out
     for stage in STAGES:
         assert len(done.numbers(stage, "20 training")) == 4

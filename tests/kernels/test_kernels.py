@@ -46,6 +46,23 @@ def test_momenta_that_are_not_those_of_the_points_are_refused(case: Case) -> Non
     for wrong in (a[:-1], a[:, :-1], a[0]):
         with pytest.raises(InputError, match="the momenta `a`"):
             case.kernel.field(x, q, wrong)
+        for method in (case.kernel.hamiltonian_gradient, lambda q, a: case.kernel.hessian_product(q, a, q, a)):
+            with pytest.raises(InputError, match="the momenta `a`"):
+                method(q, wrong)
+
+
+@every_case
+def test_points_with_other_coordinates_are_refused(case: Case) -> None:
+    """More coordinates than the kernel reads would else be ignored."""
+    x, q, a = data(case)
+    for wrong in (torch.cat([x, x], 1), x[:, :-1]):
+        for method in (
+            case.kernel.field,
+            case.kernel.field_and_jacobian,
+            lambda x, q, a: case.kernel.gradient(x, x, q, a),
+        ):
+            with pytest.raises(InputError, match="the points `x`"):
+                method(wrong, q, a)
 
 
 @every_case

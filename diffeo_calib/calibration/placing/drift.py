@@ -25,7 +25,7 @@ FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""
 WORTH = 0.97
 """Part of the RMS leave-one-out error that may remain at most with the drift in the model."""
-SURE, NAMED = 2.0, 3.0
+SURE = 3.0
 """Standard deviations from which a gain in squared errors is no chance, and from which an unknown is reported."""
 
 
@@ -128,12 +128,12 @@ class Drift(DeviceSet):
             return
         u, sd = self.size_by_column[column], self.deviations[column]
         for part, what, unit in ((slice(0, 3), "shift", "mm"), (slice(3, 6), "turn", "mrad")):
-            if float((u[part] / sd[part]).abs().max()) > NAMED:
+            if float((u[part] / sd[part]).abs().max()) > SURE:
                 yield f"the measuring frame by a {what} of {1e3 * float(u[part].norm()):.2g} {unit}"
-        if float(u[6].abs()) > NAMED * float(sd[6]):
+        if float(u[6].abs()) > SURE * float(sd[6]):
             yield f"lengths by {1e6 * float(u[6]):+.2g} ppm"
         for (name, turns), own, deviation in zip(self.joints, u[7:].tolist(), sd[7:].tolist(), strict=True):
-            if abs(own) > NAMED * deviation:
+            if abs(own) > SURE * deviation:
                 yield f"the offset of {name} by {1e3 * own:+.2g} +- {1e3 * deviation:.1g} {'mrad' if turns else 'mm'}"
 
     def entry(self) -> dict[str, object]:

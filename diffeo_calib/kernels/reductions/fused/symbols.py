@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf, log
+from math import log
 from typing import Any
 
 from diffeo_calib.kernels.reductions.formulas import Unknown
@@ -41,9 +41,8 @@ EXP2 = {
     ),
 }
 """Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16 and 3e-9."""
-EXPONENTS = {"double": (-1022, 1023, 52, 64), "float": (-126, 127, 23, 32)}
-"""Smallest and largest power of 2, bits of the fraction, bits of a number. The largest is also what the bits of an
-exponent have added."""
+EXPONENTS = {"double": (1023, 52, 64), "float": (127, 23, 32)}
+"""What the bits of an exponent have added, bits of the fraction, bits of a number."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,11 @@ class Code:
         v = self.vector
         return self.value(f"call {v} @llvm.fmuladd.{v.suffix}({v} {a}, {v} {b}, {v} {c})")
 
-    def replaced(self, x: str, side: str, limit: float, instead: float, y: str) -> str:
-        """A number where x is below ("olt") or above ("ogt") a limit, else y, also where x is NaN."""
+    def bounded(self, x: str, limit: str, side: str) -> str:
+        """The limit where x is below ("olt") or above ("ogt") it; NaN stays NaN."""
         v = self.vector
-        beyond = self.value(f"fcmp {side} {v} {x}, {self.constant(limit)}")
-        return self.value(f"select <{v.lanes} x i1> {beyond}, {v} {self.constant(instead)}, {v} {y}")
+        beyond = self.value(f"fcmp {side} {v} {x}, {limit}")
+        return self.value(f"select <{v.lanes} x i1> {beyond}, {v} {limit}, {v} {x}")
 
     def exp2(self, x: str, factor: float, above: bool, below: bool) -> str:
         """2^(factor x); beyond the range of powers 0 or infinity.
@@ -117,10 +116,14 @@ class Code:
         Args:
             above, below: whether x may lead above, below the range of powers.
         """
-        low, high, fraction, bits = EXPONENTS[self.vector.real]
+        bias, fraction, bits = EXPONENTS[self.vector.real]
+        # without a fraction, an exponent of zeros is 0 and one of ones is infinite
+        for cut, limit in ((above, (bias + 1) / factor), (below, -bias / factor)):
+            if cut:
+                x = self.bounded(x, self.constant(limit), "ogt" if limit > 0 else "olt")
         v, c = self.vector, self.constant(factor)
         # adding it rounds to integers, in the last bits of the sum: those of an exponent
-        shift = self.constant(1.5 * 2.0**fraction + high)
+        shift = self.constant(1.5 * 2.0**fraction + bias)
         moved = self.fused(x, c, shift)
         f = self.fused(x, c, self.value(f"fneg {v} {self.call('fsub', moved, shift)}"))
         p, *rest = (self.constant(c) for c in reversed(EXP2[self.vector.real]))
@@ -130,11 +133,7 @@ class Code:
         power = self.value(f"bitcast {v} {moved} to {whole}")
         places = f"<{', '.join([f'i{bits} {fraction}'] * self.vector.lanes)}>"
         power = self.value(f"bitcast {whole} {self.value(f'shl {whole} {power}, {places}')} to {v}")
-        found = self.call("fmul", p, power)  # a product, so that NaN stays NaN whatever its bits
-        for cut, limit, instead in ((above, high / factor, inf), (below, low / factor, 0.0)):
-            if cut:
-                found = self.replaced(x, "ogt" if limit > 0 else "olt", limit, instead, found)
-        return found
+        return self.call("fmul", p, power)  # a product, so that NaN stays NaN whatever its bits
 
 
 class Symbol(Unknown):
@@ -231,7 +230,7 @@ class Symbol(Unknown):
         """max(x, 0), elementwise."""
         if self.positive and self.scale >= 0.0:
             return self
-        return Symbol(self.code, self.code.replaced(self.plain, "olt", 0.0, 0.0, self.plain), 1.0, True)
+        return Symbol(self.code, self.code.bounded(self.plain, self.code.constant(0.0), "olt"), 1.0, True)
 
     def square(self) -> Symbol:
         """Elementwise."""
