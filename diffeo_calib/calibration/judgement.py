@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Step, out_of_step
+from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
@@ -198,14 +199,11 @@ class Judgement:
     rows: int = 0
 
 
-def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
-    """Name rows that look wrong, and likely causes of large errors.
+def refuse_impossible(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
+    """Raise MeasurementError for errors that say nothing about the robot, with the likely mistake.
 
     Args:
         model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
-
-    Raises:
-        MeasurementError: rows out of step with their joints, or errors that say nothing about the robot.
     """
     for table, _ in divided(data)[1]:
         devices = places.devices[sensor_key(table)]
@@ -218,23 +216,45 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
             fix = "check --length, the columns of --reading, and --session, which names the device of every row"
             raise MeasurementError.of(what, got=f"{got} mm at the ball", fix=fix)
     seen = positions_of(model, places, data)
+    if seen is None or found.positions is None or not impossible(model, found.positions):
+        return
+    some = _refused_steps(model, seen)
+    if not motions(model, some):
+        refuse_mistakes(model.robot, some)
+    raise MeasurementError(" ".join(_causes(model, some, found.positions)))
+
+
+def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
+    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`refuse_impossible`.
+
+    Raises:
+        MeasurementError: rows out of step with their joints.
+    """
+    seen = positions_of(model, places, data)
     if seen is None or found.positions is None:
         return Judgement()
-    some = seen.rows(slice(None, None, -(-len(seen) // MOST_ROWS)))
-    steps = steps_of(model, some)
-    if steps:
-        raise MeasurementError(step_text(steps[0]))
-    named = motions(model, some)
-    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in named]
-    causes = causes or [text for text in [implausible(model, some, found.positions)] if text is not None]
-    if impossible(model, found.positions):
-        raise MeasurementError(" ".join(causes))
+    some = _refused_steps(model, seen)
+    causes = _causes(model, some, found.positions)
     if causes:
         return Judgement(causes)
     wrong = contradicted(model, some)
     block = block_text(model, some, wrong)
     causes = [block] if block is not None else _larger_than_expected(model, seen, found.positions) * (not wrong)
     return Judgement(causes, wrong, len(some))
+
+
+def _refused_steps(model: CalibratedKinematics, data: Measurements) -> Measurements:
+    """Evenly chosen rows; MeasurementError if they are out of step with their joints."""
+    some = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
+    for step in steps_of(model, some):
+        raise MeasurementError(step_text(step))
+    return some
+
+
+def _causes(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
+    """What moved, or that these are no errors of a calibrated robot."""
+    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in motions(model, some)]
+    return causes or [text for text in [implausible(model, some, errors)] if text is not None]
 
 
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:

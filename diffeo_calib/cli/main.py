@@ -1,9 +1,10 @@
 """The command line: fit, campaign, evaluate, predict, correct, export, plan, recalibrate, compare, report, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
-out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first): such
-numbers say nothing about the robot, and a script must not take them for a result; 2 wrong usage; 3 the fit stopped
-before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is written).
+out of step with their joints (the errors are printed first), or a median error above a tenth of the robot's reach (no
+number is printed: it would say nothing about the robot, and a script must not take it for a result); 2 wrong usage;
+3 the fit stopped before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is
+written).
 
 The module declarations.py only declares the commands. Each command imports its work when it runs, so that help, the
 version and shell completion load neither torch nor SciPy and appear at once.

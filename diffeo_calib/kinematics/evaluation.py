@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, outside_inference_mode
-from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import Predicted
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -34,6 +35,8 @@ LARGEST_ERROR_PER_EXPECTED = 20.0
 """Median errors above this multiple of the error that the model itself expects are implausible."""
 SAME_CONFIGURATION = 1e-9
 """Largest difference [rad or m] between the joint values of one row in two files, which comes from rounding."""
+TELLING_ROWS, TELLING_MOTION = 10, 0.25
+"""Rows, and their median range of a joint relative to the fit's, from which they move as those of the fit."""
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
@@ -232,6 +235,9 @@ class OutsideRange:
         self.model = model
         self.rows = self.outside = 0
         self.joints = torch.zeros(model.robot.n, dtype=torch.bool, device=model.configurations.device)
+        self._turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=model.configurations.device)
+        self._outside_otherwise = [0 for _ in ANGLE_MISTAKES]
+        self._ends = model.configurations.new_empty(0, model.robot.n)
 
     def add(self, q: object) -> None:
         """Count configurations (N, n), rad or m."""
@@ -239,6 +245,33 @@ class OutsideRange:
         self.rows += len(outside)
         self.outside += int(outside.any(1).sum())
         self.joints |= outside.any(0)
+        values = self.model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+        for number, (factor, _) in enumerate(ANGLE_MISTAKES):
+            meant = torch.where(self._turning, factor * values, values)
+            self._outside_otherwise[number] += int(joints_outside_range(self.model, meant).any(1).sum())
+        ends = torch.cat([self._ends, values])
+        self._ends = torch.stack([ends.amin(0), ends.amax(0)]) if len(ends) else ends
+
+    def refuse_other_unit(self) -> None:
+        """Raise MeasurementError for joint values that look like the rows of the fit in the other unit of angles.
+
+        All of them are then within the joint ranges of the fit, and as they are none is, or they hardly move.
+        """
+        for outside, (factor, words) in zip(self._outside_otherwise, ANGLE_MISTAKES, strict=True):
+            tells = self.rows > 0 and bool(self._turning.any())
+            if tells and outside == 0 and (self.outside == self.rows or self._moves_as_in_fit(factor)):
+                expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
+                raise MeasurementError.of("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+
+    def _moves_as_in_fit(self, factor: float) -> bool:
+        """Whether the turning joints move as in the fit if their values are multiplied by a factor, but hardly else."""
+        fitted = self.model.configurations
+        moved = (self._ends[1] - self._ends[0]) / (fitted.amax(0) - fitted.amin(0)).clamp(min=SAME_CONFIGURATION)
+        return (
+            factor > 1.0
+            and self.rows >= TELLING_ROWS
+            and float(factor * moved[self._turning].median()) > TELLING_MOTION
+        )
 
     def warn(self) -> None:
         """Warn (DiffeoCalibWarning) with the number of rows and the names of the joints, if there are any."""
@@ -250,17 +283,20 @@ class OutsideRange:
             warn_user(sentence(what, fix=fix))
 
 
-def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
+def warn_outside_range(model: CalibratedKinematics, q: object, *, refuse_other_unit: bool = False) -> None:
     """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
 
     Args:
         model: the calibrated model. q: (N, n) joint configurations, rad or m.
+        refuse_other_unit: see :meth:`OutsideRange.refuse_other_unit`.
 
     Warns:
         DiffeoCalibWarning: with the number of rows and the names of the joints.
     """
     found = OutsideRange(model)
     found.add(q)
+    if refuse_other_unit:
+        found.refuse_other_unit()
     found.warn()
 
 

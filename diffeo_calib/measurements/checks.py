@@ -32,6 +32,15 @@ LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
 """No rotation is written with larger values, apart from rounding."""
 
 
+ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))
+"""Factor that undoes a wrong unit of joint values, and what they then are."""
+
+
+def angle_mistake(words: str) -> str:
+    """What a wrong unit of joint values is called."""
+    return f"the joint values seem to be {words}; check the angle unit"
+
+
 def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
     """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
     if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:

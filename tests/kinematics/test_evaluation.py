@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import (
+    OutsideRange,
     implausible,
     impossible,
     joints_outside_range,
@@ -189,6 +190,25 @@ def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
         warn_outside_range(arm.model, q)
     assert record[0].filename == __file__
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(math.pi / 180, "radians"), (180 / math.pi, "degrees")])
+def test_joint_values_in_the_other_unit_of_angles_are_refused(factor: float, unit: str, arm: Case) -> None:
+    for q in (arm.test.q[:40], arm.test.q[:40] - arm.test.q[:40].mean(0) + arm.train.q.mean(0)):
+        found = OutsideRange(arm.model)
+        for row in factor * q:
+            found.add(row[None])
+        with pytest.raises(MeasurementError, match=rf"seem to be {unit}.*; check the angle unit"):
+            found.refuse_other_unit()
+
+
+def test_small_motions_are_not_refused(arm: Case) -> None:
+    few, near, whole = OutsideRange(arm.model), OutsideRange(arm.model), OutsideRange(arm.model)
+    few.add(arm.train.q.mean(0)[None] + 1e-3)
+    near.add(arm.train.q.mean(0) + 1e-4 * (arm.train.q - arm.train.q.mean(0)))
+    whole.add(arm.train.q)
+    for found in (few, near, whole, OutsideRange(arm.model)):
+        found.refuse_other_unit()
 
 
 def test_implausible_errors_have_a_sentence(arm: Case) -> None:

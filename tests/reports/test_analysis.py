@@ -238,7 +238,7 @@ def test_a_single_new_row_is_shown(arm: Case) -> None:
 
 
 def test_errors_that_no_calibrated_robot_has_are_not_praised(arm: Case) -> None:
-    with pytest.raises(MeasurementError, match="calibrated robot"):
+    with pytest.raises(MeasurementError, match="left-handed"):
         find(arm.model, dc.Measurements(arm.test.q, arm.test.points[..., [1, 0, 2]]))
     noise = 0.01 * torch.randn(300, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     found = find(arm.model, dc.Measurements(arm.test.q, arm.test.points + noise))

@@ -19,6 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import LONGEST_NAME, InputError, sentence, shown, warn_user
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.table import Measurements
@@ -249,9 +250,8 @@ def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def _corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
     names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
-    for factor, words in ((pi / 180, "degrees: convert them to radians"), (180 / pi, "radians that were converted")):
-        q = torch.where(turning, factor * data.q, data.q)
-        yield q, f"the joint values seem to be {words}; check the angle unit"
+    for factor, words in ANGLE_MISTAKES:
+        yield torch.where(turning, factor * data.q, data.q), angle_mistake(words)
     for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
         q = torch.where(turning, data.q, factor * data.q)
         yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"

@@ -21,6 +21,7 @@ from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     ROBUST,
+    can_register,
     distances,
     largest_distances,
     register_inliers,
@@ -148,6 +149,13 @@ def registered(robot: Tree, data: Measurements) -> Identification:
     _check_gross_outliers(robot, data, registration)
     _check_markers(robot, data, registration)
     return registration
+
+
+def refuse_mistakes(robot: Tree, data: Measurements) -> None:
+    """Raise MeasurementError for rows far from a model that no base and markers explain, with the likely mistake."""
+    if len(data) >= 2 * (2 + robot.n) and can_register(data.points):
+        _check_units(robot, data)
+        _check_registration(robot, data, register_inliers(robot, data)[0])
 
 
 def check_identification(data: Measurements, identification: Identification) -> None:

@@ -33,6 +33,10 @@ from diffeo_calib.sensors.errors import Evaluations
 GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
 MOST_CONFIGURATIONS = 100_000
+MOST_USUAL = 100
+"""Rows of the fit that show how certain a model is there."""
+UNKNOWN_PER_USUAL = 5.0
+"""Expected errors of rows, relative to those at the rows of the fit, from which rows do not tell whether it changed."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,18 +49,31 @@ class Comparison:
         errors: of the rows from the model, devices and markers found anew, kind by kind and in the unit of each.
         expectations: what the model's own uncertainty and noise lead to expect of them. Of each ``rms`` and
             ``expected`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
+        usual: what was expected of them where the old model is as certain as at the rows of its fit.
     """
 
     moved: Registration | None
     changes: Changes
     errors: Evaluations
     expectations: Evaluations
+    usual: Evaluations
 
     rms = property(lambda self: self.errors.rms)
     expected = property(lambda self: self.expectations.rms)
 
+    @property
+    def telling(self) -> bool:
+        """Whether the old model is certain enough at these rows: what it does not know there hides changes."""
+        return any(one.rms < UNKNOWN_PER_USUAL * self.usual[kind].rms for kind, one in self.expectations.items())
+
     def __str__(self) -> str:
-        return str(self.changes)
+        if self.telling or self.changes.found:
+            return str(self.changes)
+        return (
+            "these rows cannot tell whether anything has changed: the old model expects errors of them "
+            f"({self.expectations.rms_text}) far above those at the rows of its fit ({self.usual.rms_text}); measure "
+            "poses like those of the fit, or recalibrate with these rows"
+        )
 
     def __repr__(self) -> str:
         return f"Comparison(rms: {self.errors.rms_text}; expected: {self.expectations.rms_text}: {self})"
@@ -154,8 +171,17 @@ def compare(
     warn_of_scale(rows)
     own = rows.posterior.diagonal().view(rows.y.shape) - rows.shifts.square().sum(-1)
     deviations = (own + rows.noise.diagonal(dim1=1, dim2=2)).clamp(min=0).sqrt()
-    expected = deviations.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
-    return Comparison(found, changes, rows.by_kind(rows.placed_residual), rows.by_kind(expected))
+    hidden = ~rows.noise_model.coordinates(rows.y)
+    usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
+    kinds = (rows.placed_residual, *(one.masked_fill(hidden, nan) for one in (deviations, usual)))
+    return Comparison(found, changes, *map(rows.by_kind, kinds))
+
+
+def _usual_deviation(model: CalibratedKinematics) -> float:
+    """Standard deviation of a model per coordinate at the rows of its fit, m, noise left out."""
+    q = model.configurations
+    _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
+    return float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0).sqrt())
 
 
 def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:

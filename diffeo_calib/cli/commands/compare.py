@@ -37,6 +37,7 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         return
     record.add(
         changes=changes_entry(found.changes),
+        rows_can_tell=found.telling,
         **({} if found.moved is None else {"transform": found.moved.transform}),
         **entries_by_kind(
             {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
@@ -46,7 +47,7 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         say(line)
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
-    for line in change_lines(found.changes):
+    for line in change_lines(found.changes) if found.changes.found else [str(found)]:
         say(line)
 
 

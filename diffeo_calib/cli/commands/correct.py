@@ -79,7 +79,7 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     oriented = targets is None or targets.ndim == 4
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
     sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
-    warn_outside_range(kinematics, start)
+    warn_outside_range(kinematics, start, refuse_other_unit=True)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of
+from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of, refuse_impossible
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines, table_of
@@ -61,6 +61,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
+    refuse_impossible(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), path.name)
     if options.residuals is not None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
 from pathlib import Path
@@ -206,12 +206,21 @@ def run(path: Path, given: Export) -> None:
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
-    for line in export.lines:
+    for line in (*export.lines, *_open_lines(export.model, rigid)):
         say(line)
     for option in export.files:
         say(f"{option[2:]}: {wanted[option]}")
     for line in programs.write():
         say(line)
+
+
+def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
+    """What the rows of the fit leave open, if rigid kinematics are written: base and tool are right only together."""
+    if rigid and (places := ExpectedError.of(model).open_places):
+        yield (
+            f"the rows of the fit leave {' and '.join(places)} open: base and tool of these files may both stand apart "
+            "from the model's along it; use them together, at poses like those of the fit"
+        )
 
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:

@@ -36,6 +36,7 @@ def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> N
     """Find all mistakes in a table, and warn of rows outside the joint ranges of the fit."""
     outside = OutsideRange(model)
     file.check(lambda values: outside.add(values.q), lambda part: progress(CHECKING, int(PERCENT * part), PERCENT))
+    outside.refuse_other_unit()
     outside.warn()
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS
+from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
@@ -243,6 +244,8 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
         named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
+        if not named:
+            refuse_mistakes(model.robot, data)
         raise MeasurementError(" ".join([*(named or [text or ""]), data.set_up_hint]).strip())
     if not named:
         named = [text or block_text(model, data, list(outliers)) or ""]

@@ -117,16 +117,15 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     tool = tool[model.nominal.geometry.slices["tool"]]
     open_directions = found.rows.map.open_directions[tool]
     variances = found.rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
-    deviation, place = variances.sqrt().max(0)
-    number, axis = divmod(int(place), 3)
+    number, axis = divmod(int(variances.argmax()), 3)
     far = rough_millimetres(expected.error.whole)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
     if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
         what = model.bodies.name(number, len(found.rows.on))
-        known = f"{rough_millimetres(float(deviation))} mm along {'xyz'[axis]} of {printable(found.rows.on[number])}"
+        along = f"along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
-            f"{far}, because {what} and base can hardly be told apart (the {what} is known to {known}). To change "
-            "that, measure poses in which the tool is turned about other axes, such as those listed under Where."
+            f"{far}, because {what} and base can hardly be told apart {along}. To change that, measure poses in which "
+            "the tool is turned about other axes, such as those listed under Where."
         )
     else:
         yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."

@@ -1,0 +1,37 @@
+"""What a comparison with new rows says where the old model knows little of them."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from diffeo_calib.calibration.recalibration.changes import Change, Changes
+from diffeo_calib.calibration.recalibration.compare import Comparison
+
+GRAVITY = Change("gravity", 1e-3, angle=False, displacement=1e-3, probability=1e-4)
+
+
+class Rms(dict[str, SimpleNamespace]):
+    """Errors of positions, m."""
+
+    def __init__(self, rms: float) -> None:
+        super().__init__(position=SimpleNamespace(rms=rms))
+        self.rms_text = f"{1e3 * rms:g} mm"
+
+
+@pytest.mark.parametrize(
+    ("expected", "found", "words"),
+    [
+        (0.0289, (), r"cannot tell .*28\.9 mm.*0\.2 mm"),
+        (3e-4, (), "no change"),
+        (0.0289, (GRAVITY,), "gravity has changed"),
+    ],
+)
+def test_rows_of_which_the_old_model_knows_little(expected: float, found: tuple[Change, ...], words: str) -> None:
+    changes = Changes(found, {"gravity": 1.0}, 1.0, 20, 0.01)
+    compared = Comparison(None, changes, *[cast("Any", Rms(rms)) for rms in (3.4e-3, expected, 2e-4)])
+    assert compared.telling == (expected < 1e-3)
+    assert re.search(words, str(compared))
