@@ -5,11 +5,12 @@
 #
 # The results go to demo_output/ in the project's root.
 set -euo pipefail
+EXTRAS="[fused]"
 # shellcheck source=scripts/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 
 OUTPUT=demo_output
-say "running the demonstration"
+say "running the demonstration, about a minute"
 "$VENV/bin/diffeo-calib" demo --output "$OUTPUT" "$@"
 
 figures="$(find "$OUTPUT" -type f \( -name '*.html' -o -name '*.png' -o -name '*.pdf' -o -name '*.svg' \) | sort)"

@@ -1,5 +1,7 @@
 # Shared by test.sh and demo.sh: `source` it. Prepares .venv in the project's root and changes to that root.
 #
+# EXTRAS, set before, names extras of the package, such as "[test]"; none by default.
+#
 #   DIFFEO_CALIB_TORCH    another requirement for torch, e.g. "torch==2.13.0+cu130" (default: see install_torch)
 #   DIFFEO_CALIB_PYTHON   the Python to make .venv with (default: the first one that is new enough)
 # shellcheck shell=bash
@@ -8,7 +10,8 @@ set -euo pipefail
 DEFAULT_TORCH="torch==2.13.0"
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
-STAMP="$VENV/installed"
+EXTRAS="${EXTRAS:-}"
+STAMP="$VENV/installed$EXTRAS"
 
 say() { printf '== %s\n' "$*"; }
 
@@ -46,7 +49,7 @@ sys.exit(tuple(int(part) for part in version("torch").split(".")[:2]) < (2, 6))
 PYTHON
 }
 
-pip_install() { "$VENV/bin/python" -m pip install --disable-pip-version-check "$@"; }
+pip_install() { "$VENV/bin/python" -m pip install --disable-pip-version-check --quiet "$@"; }
 
 # One exact version, and before the package: a range could bring another build. pip takes a CPU build of it where one is
 # offered (a local wheel, a mirror, or an index named in PIP_EXTRA_INDEX_URL). Elsewhere on Linux it is the ordinary
@@ -55,6 +58,7 @@ install_torch() {
   if [ -z "${DIFFEO_CALIB_TORCH:-}" ] && has_torch; then
     say "torch is installed already"
   else
+    say "installing torch (a download of 0.2 GB, or several GB with CUDA)"
     pip_install "${DIFFEO_CALIB_TORCH:-$DEFAULT_TORCH}"
   fi
 }
@@ -77,9 +81,9 @@ setup() {
     return
   fi
   has_venv || make_venv
-  say "installing into .venv"
   install_torch
-  pip_install --quiet --editable ".[test]"
+  say "installing diffeo_calib$EXTRAS and what it needs"
+  pip_install --editable ".$EXTRAS"
   fingerprint >"$STAMP"
 }
 

@@ -6,6 +6,7 @@
 #
 # Tests on real measurements need their folder in DIFFEO_CALIB_DATA, else they are skipped and say so.
 set -euo pipefail
+EXTRAS="[test]"
 # shellcheck source=scripts/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 

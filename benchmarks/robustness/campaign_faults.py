@@ -127,7 +127,7 @@ class Site:
         journal = [json.loads(line) for line in (self.folder / "run.csv.journal").read_text().splitlines()]
         judged = [one["line"] - 2 for one in journal if one.get("rows")]
         numbers = [float(one["id"] or -1) for one in found]
-        whole = [row for row in found if {name: float(value) for name, value in row.items()} in self.wanted]
+        whole = [row for row in found if None not in row.values() and _numbers(row) in self.wanted]
         missing = {number for number in self.answered if numbers.count(number) == 0}
         return {
             "lost": len(missing) + len(set(range(len(found))) - set(judged)),
@@ -179,6 +179,10 @@ class Client:
         """Send a row."""
         self.write(as_line(row))
         return self.read()
+
+
+def _numbers(row: dict[str, str]) -> Row:
+    return {name: float(value) for name, value in row.items()}
 
 
 def as_line(row: Row) -> bytes:

@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from io import FileIO
@@ -27,6 +28,10 @@ try:
     import fcntl
 except ImportError:  # Windows: two writers are not noticed there
     fcntl = None
+
+
+STILL_SECONDS = 5.0
+"""Time after which no program is writing half a line any more."""
 
 
 class Journal:
@@ -146,27 +151,33 @@ class GrowingTable:
         marked = [repr(value).replace(".", self._decimal) if isinstance(value, float) else value for value in values]
         return self.header or self._line(header), self._line(marked)
 
-    def append(self, header: bytes, line: bytes) -> None:
-        """Append a line, whole or not at all, after the header if the file is empty; InputError if it cannot be."""
+    def append(self, header: bytes, line: bytes) -> bytes:
+        """Append a line, whole or not at all, after the header if the file is empty.
+
+        Returns:
+            half a line that a crash had left at the end: it was removed.
+
+        Raises:
+            InputError: it cannot be written, or another program is writing a line.
+        """
         try:
             with self.path.open("a+b", buffering=0) as file:
-                self._check_end(file)
-                append_whole(file, line if file.tell() else header + line)
+                torn = self._torn(file)
+                file.truncate(file.seek(0, os.SEEK_END) - len(torn))
+                append_whole(file, line if file.seek(0, os.SEEK_END) else header + line)
         except OSError as error:
             raise InputError.of(f"{self.path} cannot be written ({error.strerror})", fix=FULL) from error
+        return torn
 
-    def repair(self) -> None:
-        """Remove the half of a line that a crash left at the end."""
-        if self.path.exists():
-            content = self.path.read_bytes()
-            os.truncate(self.path, content.rfind(b"\n") + 1)
-
-    def _check_end(self, file: FileIO) -> None:
-        if file.seek(0, os.SEEK_END):
-            file.seek(-1, os.SEEK_END)
-            if file.read(1) != b"\n":
-                fix = "let one program write the table; send the row again"
-                raise InputError.of(f"another program is writing a line of {self.path}", fix=fix)
+    def _torn(self, file: FileIO) -> bytes:
+        """Half a line at the end of the file; InputError if it has just been written."""
+        file.seek(self._place)
+        content = file.read()
+        torn = content[content.rfind(b"\n") + 1 :]
+        if torn and time.time() - os.fstat(file.fileno()).st_mtime < STILL_SECONDS:
+            fix = "let one program write the table; send the row again"
+            raise InputError.of(f"another program is writing a line of {self.path}", fix=fix)
+        return torn
 
     def _line(self, cells: Sequence[object]) -> bytes:
         text = io.StringIO()

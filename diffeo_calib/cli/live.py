@@ -156,7 +156,10 @@ class Live:
         self.judge(self.new_lines())
         header, line = self.table.written(row)
         self._read([line], header, len(self.lines))
-        self.table.append(header, line)
+        torn = self.table.append(header, line).decode(errors="replace")
+        if torn:
+            self.journal.add([{"removed": torn}])
+            self.say(f"half a line was removed from the end of {self.source.csv}: {torn}", {"removed": torn})
         *others, own = self.new_lines()
         self.judge(others)
         return self._add(own)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import os
 import random
 import signal
 import subprocess
@@ -97,8 +98,8 @@ def test_rows_are_appended_whole(tmp_path: Path) -> None:
     assert table.new_lines() == [b"1,5;s\n"]
     with pytest.raises(InputError, match="another program"):
         table.append(*table.written({"a": 2}))
-    table.repair()
-    table.append(*table.written({"b": "t", "a": -2e-05}))
+    os.utime(path, (0, 0))
+    assert table.append(*table.written({"b": "t", "a": -2e-05})) == b"7;"
     table.append(*table.written({"a": None, "b": 3}))
     assert table.new_lines() == [b"-2e-05;t\n", b";3\n"]
     with pytest.raises(InputError, match="columns c"):

@@ -78,8 +78,6 @@ def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -
 
 def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
-    if given.stdin or given.listen is not None:
-        live.table.repair()
     if given.stdin:
         Thread(target=read_lines, args=(sys.stdin.buffer, inbox, lambda _: None), daemon=True).start()
     while True:
