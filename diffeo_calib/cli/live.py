@@ -47,7 +47,7 @@ class Live:
         tips: of the markers. table: the file. owner: the line of each row. lines: all that were judged.
         waiting: those that were there at the start and were not. ids: number of the line of each id.
         said: whether each row is accepted, and to be repeated. unreadable: lines that are no rows, and why.
-        revised: rows that the last line changed.
+        revised: rows that the last line changed. late: rows that a new model changed, not told yet.
     """
 
     campaign: Campaign
@@ -63,6 +63,7 @@ class Live:
     ids: dict[str, int] = field(default_factory=dict)
     unreadable: dict[int, str] = field(default_factory=dict)
     revised: list[int] = field(default_factory=list)
+    late: list[int] = field(default_factory=list)
     _found: tuple[object, Next | None] | None = None
 
     def __post_init__(self) -> None:
@@ -117,8 +118,10 @@ class Live:
         if not self.campaign.poll():
             return False
         self.journal.add(self._revised())
-        changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
-        self._say(({"text": changed} if changed else {}) | self.state())
+        self.late += self.revised
+        if not self.goal.lines:  # those who send rows as JSON lines get one answer for each
+            changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
+            self._say(({"text": changed} if changed else {}) | self.state())
         return True
 
     def take(self, sent: Sent) -> None:
@@ -200,7 +203,8 @@ class Live:
         rows = [row for row, owner in enumerate(self.owner) if owner == number]
         found |= known[rows[0]].entry()
         found["text"] = "\n".join(str(known[row]) for row in rows)
-        return found | {"revised": [{"row": row, "accepted": known[row].accepted} for row in self.revised]}
+        revised, self.late = dict.fromkeys([*self.late, *self.revised]), []
+        return found | {"revised": [{"row": row, "accepted": known[row].accepted} for row in revised]}
 
     def _say(self, told: Entry) -> None:
         """Print an answer."""

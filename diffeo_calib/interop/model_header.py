@@ -42,6 +42,8 @@ from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.places import PlacedDevices
 
 UNITS = {"length": "m", "angle": "rad"}
+LARGEST_PARAMETER = 1e6
+"""Of a robot, m or rad: beyond it results have no correct digits."""
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
 """Entries that a header may have or not."""
@@ -250,6 +252,9 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
+    if isinstance(nominal, GeometryMap) and size and float(tensors["theta"].abs().max()) > LARGEST_PARAMETER:
+        got = f"{float(tensors['theta'].abs().max()):.3g}"
+        raise InputError.of("the tensor theta", expected=f"at most {LARGEST_PARAMETER:g}", got=got)
     if "scales" in tensors and bool((tensors["scales"] < 0).any()):
         raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors["scales"].min()))
     check_covariance(tensors["new_noise"], "the tensor new_noise")

@@ -28,8 +28,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -156,7 +155,7 @@ class GravitySag:
         places, ground = self.chain.places(q), self.chain.ground_place
         return places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
 
-    def _sag(self, w: Tensor) -> Any:
+    def _sag(self, w: Tensor) -> _Sag:
         """The tensors that runtime/chain.py takes for a :class:`Sag` with these coefficients."""
         (numbers, places), F, count = self._loads.to(w.device), len(self.chain.before), len(self.compliances)
         constants = {name: value.to(w.device) for name, value in self._constants.items()}
@@ -166,7 +165,7 @@ class GravitySag:
         moments = w.new_zeros(count * F, 3, 3).index_add(0, numbers * F + places, -turning)
         moments = moments.index_add(0, numbers * F + joints, turning).view(count, F, 3, 3).transpose(1, 2)
         forces = w.new_zeros(count, 3).index_add(0, numbers, c.masked_fill(~slides, 0.0))
-        return SimpleNamespace(moments=moments.reshape(3 * count, 3 * F), forces=forces, **constants)
+        return _Sag(moments=moments.reshape(3 * count, 3 * F), forces=forces, **constants)
 
     @cached_property
     def _loads(self) -> Tensor:
@@ -195,6 +194,18 @@ class GravitySag:
             "moved": moved,
             "signs": signs,
         }
+
+
+class _Sag(NamedTuple):
+    """The part of :class:`diffeo_calib.runtime.chain.Sag` that its equations need; compilers follow named tuples."""
+
+    moments: Tensor
+    forces: Tensor
+    joints: Tensor
+    axes: Tensor
+    directions: Tensor
+    moved: Tensor
+    signs: Tensor
 
 
 def _column(values: Sequence[Any], dtype: torch.dtype) -> Tensor:

@@ -89,6 +89,7 @@ class RadialTerm:
         exponents = self._with_one(F) @ self._exponents[stage]
         if self.lines:
             exponents -= 0.5 * (F * F).sum(1, keepdims=True)
+            np.minimum(exponents, 0.0, out=exponents)  # points that are absurdly far away lose all digits
         return np.exp(exponents, out=exponents)
 
     def _squares(self, stage: int, F: Array) -> Array:

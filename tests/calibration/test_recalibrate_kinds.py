@@ -136,6 +136,18 @@ def test_a_recalibrated_model_keeps_its_devices(seen: bool) -> None:
         assert bool(((other.mean - one.mean - further).abs() < allowed)[one.mean.isfinite()].all()), one.device
 
 
+def test_sockets_of_a_registered_model_are_known_as_means_of_their_rows() -> None:
+    kind = kind_named("mixture")
+    found = quietly(kind.model.registered, kind.moved)
+    sockets = next(own for own in found.placement if own.kind == "socket")
+    seen = found(kind.moved.q).detach()[:, -1].numpy()
+    assert set(sockets.names) == set(kind.moved.row_sockets) - {""}
+    for name, place, deviation in zip(sockets.names, sockets.constants, sockets.deviations, strict=True):
+        own = seen[[row for row, other in enumerate(kind.moved.row_sockets) if other == name]]
+        assert own.mean(0) == pytest.approx(place.numpy(), abs=1e-9)
+        assert own.std(0, ddof=1) / len(own) ** 0.5 == pytest.approx(deviation.numpy(), rel=1e-6)
+
+
 def test_a_session_that_deviates_is_a_change_and_no_outliers() -> None:
     """A joint wears between two of three sessions."""
     model, worn = again_bank.model(again_bank.positions), ARM.worn(again_bank.WORN, 5.0)

@@ -136,7 +136,8 @@ def test_bad_urdf(content: str, small_site: Site, command: Command, tmp_path: Pa
 def test_missing_table(small_site: Site, command: Command, tmp_path: Path) -> None:
     done = command(*small_site.fit(tmp_path / "nowhere.csv", tmp_path / "model"))
     assert done.code == 1
-    assert "nowhere.csv' does not exist" in done.error
+    assert "there is no file" in done.error
+    assert "nowhere.csv" in done.error
     done = command(*small_site.fit(tmp_path, tmp_path / "model"))
     assert done.code == 1
     assert "cannot be opened" in done.error
