@@ -187,6 +187,5 @@ def test_hours_of_rows_need_no_more_memory(page: Page, campaign: dc.Campaign) ->
             sizes.append((session.send("Runtime.getHeapUsage")["usedSize"], tracemalloc.get_traced_memory()[0]))
         tracemalloc.stop()
         browser.close()
-    print("SIZES", sizes)
     for name, first, second in zip(("page", "server"), *sizes, strict=True):
         assert second < 1.1 * first + 1e5, (name, first, second)
