@@ -259,7 +259,7 @@ class Campaign:
             before, self.verdicts = self.verdicts, self.verdicts[:late]
             for old in before[late:]:
                 self._judge(made, self.table.rows(slice(0, old.row + 1)))
-                own = {"accepted": old.accepted, "decided": True} if old.decided else {}
+                own = {"accepted": old.accepted, "decided": True, "again": old.again} if old.decided else {}
                 self.verdicts[old.row] = replace(self.verdicts[old.row], expected_error=old.expected_error, **own)
         return made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
 

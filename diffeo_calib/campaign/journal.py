@@ -163,7 +163,8 @@ class GrowingTable:
         try:
             with self.path.open("a+b", buffering=0) as file:
                 torn = self._torn(file)
-                file.truncate(file.seek(0, os.SEEK_END) - len(torn))
+                if torn:
+                    file.truncate(file.seek(0, os.SEEK_END) - len(torn))
                 append_whole(file, line if file.seek(0, os.SEEK_END) else header + line)
         except OSError as error:
             raise InputError.of(f"{self.path} cannot be written ({error.strerror})", fix=FULL) from error

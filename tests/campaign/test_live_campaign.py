@@ -60,9 +60,11 @@ def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[
     candidates = ARM.sample(20, seed=8)
     campaign = dc.Campaign(ARM.nominal, candidates=candidates, target=candidates, background=True)
     campaign.add(q, y)
+    campaign.repeat(23)
     campaign.wait()
     assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
-    assert [one.row for one in campaign.verdicts if not one.accepted] == [20]
+    assert [one.row for one in campaign.verdicts if not one.accepted] == [20, 23]
+    assert [one.row for one in campaign.verdicts if one.again] == [23]
 
 
 def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
