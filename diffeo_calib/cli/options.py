@@ -486,9 +486,7 @@ class Planned:
         "By default 0.1 m beside and 0.1 m in front of the tip.",
         "X,Y,Z",
     )
-    target_poses: Path | None = option(
-        "Configurations at which the robot shall be accurate; by default everywhere.", "CSV"
-    )
+    target_poses: Path | None = option("Configurations where the robot shall be accurate; by default all.", "CSV")
     measured: Path | None = option("Configurations that are measured already but not in the model.", "CSV")
     free: Free | None = option("With MODEL: what has moved since its fit; base is the device's or the robot's.")
     sensor: list[str] | None = option(
