@@ -115,10 +115,6 @@ class Bench:
             assert f"{title} in {unit}" in text or re.search(rf"{kind} [\d.]+ {unit}", text), (kind, text)
         return found
 
-    def evaluate(self, *more: object) -> dict[str, Any]:
-        path, options = self.kind.table("new")
-        return self.judged("evaluate", self.kind.file, path, *options, *more)
-
     def joints(self, count: int = 4) -> Path:
         """A table of joint values in deg."""
         path, names = self.folder / "joints.csv", self.kind.robot.joint_names
@@ -267,7 +263,8 @@ def _(bench: Bench) -> None:
     """The numbers are those of Python."""
     kind, path = bench.kind, bench.folder / "residuals.csv"
     enough, too_little = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
-    found = bench.evaluate("--residuals", path, "--fail-above", enough)
+    table, options = kind.table("new")
+    found = bench.judged("evaluate", kind.file, table, *options, "--residuals", path, "--fail-above", enough)
     assert found["accepted"]
     own = dc.evaluate(kind.model, kind.new)
     for one in evaluations(own):
@@ -283,7 +280,6 @@ def _(bench: Bench) -> None:
     assert len({row["line"] for row in rows}) == len(kind.new)
     if kind.name in WITH_POSES:
         assert {"rad", "deg", "mrad"} & {row["unit"] for row in rows}
-    table, options = kind.table("new")
     said = " ".join(bench.run("evaluate", kind.file, table, *options, "--fail-above", too_little, code=4).out.split())
     assert ("expected over the joint ranges" in said) == (kind.name in FREE and kind.name != "images")  # px
 
