@@ -64,7 +64,7 @@ class Bench:
     @property
     def mass(self) -> list[str]:
         """The option of commands that need one payload."""
-        return ["--payload", "4"] * (self.kind.name == "payloads")
+        return ["--payload-mass", "4"] * (self.kind.name == "payloads")
 
     @property
     def one_tip(self) -> list[str]:

@@ -105,12 +105,12 @@ Note = Annotated[
 ]
 Mass = Annotated[
     float | None,
-    typer.Option("--payload", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),
+    typer.Option("--payload-mass", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),
 ]
 Marker = Annotated[
     MarkerFreedom,
     typer.Option(
-        "--marker",
+        "--marker-freedom",
         help="Whether the markers are the same (0.05 mm), have moved a little (1 mm) or are other ones; by default the "
         "rows decide.",
     ),
@@ -390,7 +390,7 @@ class Correction:
     rate: float | None = option(
         "The rows are a path: the correction of a joint changes by at most so many degrees from row to row.", "DEG"
     )
-    payload: Mass = None
+    payload_mass: Mass = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -428,7 +428,7 @@ class Export:
     )
     tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
     robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
-    payload: Mass = None
+    payload_mass: Mass = None
     length: Length = option("Unit of lengths in the CSV files written.", default=Length.m)
     angle: Angle = option("Unit of angles in the CSV files written.", default=Angle.rad)
 
@@ -486,7 +486,7 @@ class Planned:
         "By default 0.1 m beside and 0.1 m in front of the tip.",
         "X,Y,Z",
     )
-    target: Path | None = option("Configurations at which the robot shall be accurate; by default everywhere.", "CSV")
+    target_poses: Path | None = option("Configurations where the robot shall be accurate; by default all.", "CSV")
     measured: Path | None = option("Configurations that are measured already but not in the model.", "CSV")
     free: Free | None = option("With MODEL: what has moved since its fit; base is the device's or the robot's.")
     sensor: list[str] | None = option(
@@ -497,4 +497,4 @@ class Planned:
         "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
         "KIND[=NUMBERS]",
     )
-    payload: Mass = None
+    payload_mass: Mass = None

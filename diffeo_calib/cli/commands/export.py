@@ -191,7 +191,7 @@ def run(path: Path, given: Export) -> None:
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
-    model = load_laden(path, given.payload)
+    model = load_laden(path, given.payload_mass)
     units = TableFormat(given.length.value, given.angle.value)
     own = tool_in_tip(model, given.tool, given.tool_from.value, units)
     tool = Tool(None if given.tool is None else own, None if given.frame is None else given.frame.value)
