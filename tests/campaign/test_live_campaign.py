@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import KINDS, kind_named
+from kind_bank import KINDS, kind_named, marked
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -220,7 +220,7 @@ def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
         dc.Campaign(ARM.nominal).result()
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", marked(*KINDS))
 def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> None:
     """Taken for other rows, the rows of a calibration are what they were in it."""
     kind = kind_named(name)
