@@ -339,9 +339,15 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
     assert 'angle = "deg"' in text
     frame = dc.Measurements(*arm.measure(40, seed=0), arm.nominal.joint_names).to_frame()
     frame["payload_kg"] = [0.0, 2.0] * 20
+    frame["time_s"], frame["Temperature"] = range(40), [21.5] * 40
     frame.to_csv(tmp_path / "t.csv", index=False)
     assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "d.toml").code == 0
-    assert 'payload = "payload_kg"' in (tmp_path / "d.toml").read_text()
+    proposed = tomllib.loads((tmp_path / "d.toml").read_text())
+    assert {name: proposed[name] for name in ("payload", "time", "temperature")} == {
+        "payload": "payload_kg",
+        "time": "time_s",
+        "temperature": "Temperature",
+    }
 
 
 @pytest.mark.parametrize("name", ["several tips", "camera on the tool"])

@@ -36,6 +36,7 @@ from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 PROGRAMS = ("--c", "--torch", "--onnx")
 MEGABYTE = 1e6
@@ -209,7 +210,7 @@ def run(path: Path, given: Export) -> None:
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
-    for line in (*export.lines, *_open_lines(export.model, rigid)):
+    for line in (*export.lines, *_open_lines(export.model, rigid), *_drift_lines(model)):
         say(line)
     for option in export.files:
         say(f"{option[2:]}: {wanted[option]}")
@@ -224,6 +225,14 @@ def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[s
             f"the rows of the fit leave {' and '.join(places)} open: base and tool of these files may both stand apart "
             "from the model's along it; use them together, at poses like those of the fit"
         )
+
+
+def _drift_lines(model: CalibratedKinematics) -> Iterator[str]:
+    """What files that know no time or temperature hold of a drift."""
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield from drift.sentences()
+        yield f"no file knows the {' or the '.join(drift.names)}: they hold at {drift.holds()}"
 
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:
