@@ -203,7 +203,7 @@ class CalibratedKinematics:
 
     @property
     def registration(self) -> Registration | None:
-        """What the registration found if the model was registered; None for a model in the place of its fit."""
+        """Result of the registration; None for a model in the place of its fit."""
         return self.map.registration
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
@@ -393,7 +393,7 @@ class CalibratedKinematics:
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
 
     def predict_readings(self, q: object, *, noise: bool = True) -> list[PredictedReadings]:
-        """What the devices of the fit will read of the ball: distances, heights, images, each in its unit.
+        """Predicted readings of the fit's devices: distances, heights, images, each in its unit.
 
         Args:
             q: (N, n) joint configurations.
@@ -477,5 +477,5 @@ class CalibratedKinematics:
 
 
 def measured_words(model: Any) -> str:
-    """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
+    """Targets of the calibration, such as "poses" or "2 marker(s)"."""
     return kind_of_points(model.markers, model.lever)

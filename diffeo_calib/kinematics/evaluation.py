@@ -308,7 +308,7 @@ def warn_outside_range(model: CalibratedKinematics, q: object, *, refuse_other_u
 
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
-    """Whether errors are so large that they say nothing about the robot: a median above a tenth of its reach."""
+    """Whether errors are too large to describe the robot: a median above a tenth of its reach."""
     return implausibly_far(model, errors.median)
 
 

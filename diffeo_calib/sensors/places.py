@@ -379,7 +379,7 @@ class PlacedDevices:
 
     @classmethod
     def from_entry(cls, entry: Any, rows: int) -> PlacedDevices:
-        """The inverse of :meth:`entry`, for a fit of so many rows.
+        """The inverse of :meth:`entry`, for a fit with this number of rows.
 
         Raises:
             InputError: entries that do not fit together.

@@ -82,7 +82,7 @@ def register_again(
 
 
 class FoundPlace(NamedTuple):
-    """What a registration found.
+    """Result of a registration.
 
     Args:
         registration: its record. odds: probability of each prior deviation of the markers, m.
