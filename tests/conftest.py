@@ -10,6 +10,7 @@ import os
 import re
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process that a test starts compiles the package
 
 
 from pathlib import Path
@@ -18,7 +19,15 @@ from typing import Any
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
-from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot, with_usual_scales
+from product_bank import (
+    Case,
+    calibrated,
+    calibrated_poses,
+    simulated,
+    sliding_measurements,
+    sliding_robot,
+    with_usual_scales,
+)
 
 import diffeo_calib as dc
 
@@ -30,9 +39,11 @@ def arm() -> Case:
 
 
 @pytest.fixture(scope="session")
-def arm_200() -> Case:
-    """The simulated arm, calibrated with 200 poses."""
-    return calibrated(200)
+def arm_200(arm: Case) -> Case:
+    """The simulated arm, calibrated with 200 poses and the scales of 60."""
+    robot, train, test = simulated(200)
+    scales = arm.result.selection.scales
+    return Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, hyperparameters=scales))
 
 
 @pytest.fixture(scope="session")
@@ -72,7 +83,10 @@ def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
-BY_KIND = ("test_matrix.py", "test_kinds_judged.py", "test_campaign.py")
+BY_KIND = (
+    *("test_matrix.py", "test_kinds_judged.py", "test_campaign.py", "test_live_campaign.py", "test_expected_errors.py"),
+    *("test_registered_kinds.py", "test_predicted_readings.py"),
+)
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,

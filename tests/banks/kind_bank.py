@@ -16,6 +16,7 @@ from typing import Any
 import golden_bank
 import inclinometer
 import laser_line
+import pytest
 import reading_bank
 import torch
 import two_arms_bank
@@ -152,10 +153,19 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "inclinations": _inclinations,
 }
 KINDS = tuple(SOURCES)
+QUICK = ("positions", "poses", "mixture", "heights")
+"""Kinds that every run tests; those of the others are slow tests."""
 POSITIONED = ("positions", "hidden markers")
 """Kinds whose tables are joint values and coordinates, and nothing else."""
+FREE = ("ball in sockets", "distances", "heights", "images")
+"""Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
 CAMERAS = ("camera on the tool", "images of a board")
+
+
+def marked(*names: str) -> list[Any]:
+    """Kinds as parameters of a test."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in names]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,13 +221,16 @@ class Kind:
         return self.result.model
 
     @cached_property
-    def other(self) -> dc.CalibratedKinematics:
-        """A second model, of other rows of the same robot."""
-        rows: Any = self.source.golden.rows
+    def part(self) -> Any:
+        """Rows of ``data``, those of `fit --holdout 0.2`."""
+        return self.data.split(0.8)[0]
+
+    @cached_property
+    def of_part(self) -> Any:
+        """The calibration of ``part``."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            part = rows.split(0.8, seed=1)[0]
-            return dc.calibrate(self.robot, part, hyperparameters=self.scales).model
+            return dc.calibrate(self.robot, self.part, hyperparameters=self.scales)
 
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""

@@ -10,7 +10,8 @@ import pytest
 import torch
 from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
-from kind_bank import KINDS, kind_named
+from kind_bank import KINDS, kind_named, marked
+from product_bank import with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -65,6 +66,7 @@ def test_residual_and_shifts_of_a_fit_leave_its_noise() -> None:
     assert float(fit.shifts.norm()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tool never turned", "tool turned about the vertical"])
 def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -> None:
     """The truth differs from the model as expected, after the marker has been put where it fits best."""
@@ -72,7 +74,7 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -
     data = measured(arm, "1 marker", CAMPAIGNS[name](arm, 60, generator), generator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that is the case
-        model = dc.calibrate(arm.nominal, data).model
+        model = with_usual_scales(arm.nominal, data).model
     found, q = ExpectedError.of(model), model.map.everywhere
     assert found.whole > 5 * found.workspace
     assert any("marker" in place for place in found.open_places)
@@ -90,7 +92,7 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -
     assert again.open_places
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", marked(*KINDS))
 def test_usual_rows_leave_no_place_open(name: str) -> None:
     found = ExpectedError.of(kind_named(name).model)
     assert found.open_places == ()

@@ -22,6 +22,7 @@ from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import in_unit, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
+from diffeo_calib.interop.mjcf import mjcf_text
 from diffeo_calib.interop.rigid import (
     RigidKinematics,
     applied_with_tables,
@@ -96,7 +97,7 @@ class Programs:
                 yield f"{option[2:]}: {target} ({target.stat().st_size / MEGABYTE:.1f} MB): {what}"
 
 
-RIGID = ("--urdf", "--dh", "--ur-kinematics")
+RIGID = ("--urdf", "--mjcf", "--dh", "--ur-kinematics")
 NOMINAL = "nominal robot, registered"
 
 
@@ -118,7 +119,7 @@ class _Export:
 
     def rigid(self, options: list[str], *, with_tables: bool, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
-        urdf = None if options == ["--dh"] else urdf_of(self.model.robot, self.given.robot)
+        urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else None
         found = rigid_kinematics(self.model, transmission=with_tables)
         self.geometry = found.geometry
         together = " and --correction-tables"
@@ -146,6 +147,8 @@ class _Export:
             self.lines += _dh_lines(table, self.given)
             return dh_text(table, self.length, self.angle)
         content = urdf or b""
+        if option == "--mjcf":
+            return mjcf_text(geometry)
         if option == "--urdf":
             return corrected_urdf(geometry, content).decode("utf-8", "surrogateescape")
         if self.given.ur_hash is None:
