@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.campaign.certainty import limit_of
 from diffeo_calib.campaign.posterior import Posterior, Rows
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
@@ -252,3 +253,33 @@ def test_other_kinds_of_rows(name: str) -> None:
     found = campaign.next(2)
     assert found is not None
     assert found.expected[2] < found.expected[0]
+
+
+def test_the_limit_holds_95_percent_of_errors() -> None:
+    random = torch.Generator("cpu").manual_seed(0)
+    root = torch.randn(60, 20, generator=random, dtype=torch.float64)
+    errors = (root @ torch.randn(20, 4000, generator=random, dtype=torch.float64)).square().mean(0).sqrt()
+    S = root @ root.T
+    limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
+    assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
+    assert limit_of(1.0, S, 0.3) > 1.4 * limit_of(1.0, S, 0.0)
+
+
+def test_a_goal_is_reached_once_the_limit_is_below_it(measured: tuple[Tensor, Tensor]) -> None:
+    """Near the goal scales are selected more often than at twice as many rows."""
+    places = ARM.sample(20, seed=8)
+    campaign = dc.Campaign(ARM.nominal, candidates=places, target=places, goal=0.3 * MM)
+    for q, y in zip(*(part[:24] for part in measured), strict=True):
+        campaign.add(q, y)
+        known, limit = campaign.expected_error, campaign.error_limit
+        assert (limit is None) == (len(campaign) < 20)
+        assert campaign.reached == (limit is not None and limit <= 0.3 * MM)
+        if limit is not None:
+            assert known is not None
+            assert 1.2 < limit / known < 2
+    assert campaign.models == 4  # at 12, 18, 20 and 23 rows
+    found = campaign.next(1)
+    assert found is not None
+    assert (found.needed == 0) == campaign.reached
+    with pytest.raises(InputError, match="goal"):
+        dc.Campaign(ARM.nominal, goal=0.0)
