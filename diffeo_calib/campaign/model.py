@@ -20,7 +20,7 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
-from diffeo_calib.campaign.verdicts import LIMITS, Change, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
@@ -189,7 +189,7 @@ class CampaignModel:
         cause = "" if fits else self._cause(table, around.data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        change = None if cause else self._change(around, seen, verdicts, typical)
+        change = None if cause else self._change(around, seen, verdicts, found, typical)
         if change is not None:
             change = replace(change, line=lines[change.row])
             for number in self.window:
@@ -222,11 +222,13 @@ class CampaignModel:
             self.last = self.posterior.see(self.last.rows, self.posterior.take(row, self.last))
         self.window, self.taken = self.window[1:], self.taken[1:]
 
-    def _change(self, around: Around, seen: Seen, verdicts: Sequence[Verdict], typical: float) -> Change | None:
+    def _change(
+        self, around: Around, seen: Seen, verdicts: Sequence[Verdict], single: Measure, typical: float
+    ) -> Change | None:
         """What changed among the last rows."""
         own = [verdicts[number] for number in self.window]
         known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        return find_change(seen, self.window, around.causes(), (known, doubted), typical=typical)
+        return find_change(seen, self.window, around.causes(), (known, doubted), single=single, typical=typical)
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
