@@ -24,6 +24,7 @@ from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 
 def load_kinematics(path: Path) -> CalibratedKinematics:
@@ -102,9 +103,19 @@ def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
 
 
 def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """When the model was fitted and to what, if its file says so."""
+    """When the model was fitted and to what, if its file says so; what drifted then, and for when the model holds."""
     if model.provenance is not None:
         yield model.provenance.sentence(model.robot.name, len(model.configurations))
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield from drift.sentences()
+
+
+def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
+    """What becomes of a drift of the fit where new rows of another date are compared or joined with it."""
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield f"{drift.of_another_date}: these rows meet the model as it was at {drift.holds()}"
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:

@@ -398,6 +398,7 @@ class Export:
     """The files to write, and how."""
 
     urdf: Path | None = option("Write the robot's own URDF with corrected joint origins.", "URDF")
+    mjcf: Path | None = option("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = option("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
     dh_convention: DH = option("Convention of --dh; craig is also called modified.", default=DH.standard)
     ur_kinematics: Path | None = option("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
@@ -405,7 +406,7 @@ class Export:
     joint_offsets: Path | None = option("Write the best joint offsets, all other geometry nominal.", "CSV")
     correction_tables: Path | None = option("Write transmission errors and their corrections by joint value.", "CSV")
     with_tables: bool = option(
-        "Fit --urdf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
+        "Fit --urdf, --mjcf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
     )
     c: Path | None = option("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
     torch: Path | None = option("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
@@ -416,9 +417,8 @@ class Export:
         "FOLDER",
     )
     tool: str | None = option(
-        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, "
-        "and a rotation vector if it is turned. By default the tip itself, or the tool that the model was saved "
-        "with.",
+        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and a "
+        "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
     tool_from: ToolFromOption = ToolFrom.tip
@@ -435,7 +435,7 @@ class Export:
     @property
     def outputs(self) -> dict[str, Path | None]:
         """Option -> file to write, None where it is not wanted."""
-        rigid = {"--urdf": self.urdf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
+        rigid = {"--urdf": self.urdf, "--mjcf": self.mjcf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
         tables = {"--joint-offsets": self.joint_offsets, "--correction-tables": self.correction_tables}
         return rigid | tables | {"--c": self.c, "--torch": self.torch, "--onnx": self.onnx, "--camera": self.camera}
 

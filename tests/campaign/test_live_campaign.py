@@ -265,21 +265,27 @@ def test_the_limit_holds_95_percent_of_errors() -> None:
     assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
 
 
-def test_a_goal_is_reached_once_the_limit_is_below_it(measured: tuple[Tensor, Tensor]) -> None:
-    """Near the goal scales are selected more often than at twice as many rows."""
-    places = ARM.sample(20, seed=8)
-    campaign = dc.Campaign(ARM.nominal, candidates=places, target=places, goal=0.3 * MM)
-    for q, y in zip(*(part[:24] for part in measured), strict=True):
-        campaign.add(q, y)
-        known, limit = campaign.expected_error, campaign.error_limit
-        assert (limit is None) == (len(campaign) < 20)
-        assert campaign.reached == (limit is not None and limit <= 0.3 * MM)
-        if limit is not None:
-            assert known is not None
-            assert 1.2 < limit / known < 2
-    assert campaign.models == 4  # at 12, 18, 20 and 23 rows
-    found = campaign.next(1)
-    assert found is not None
-    assert (found.needed == 0) == campaign.reached
+def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
+    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
+    arm = SimulatedArm(3)
+    places, (q, y) = arm.sample(10, seed=8), arm.measure(20, seed=7)
+    campaign = dc.Campaign(arm.nominal, candidates=places, target=places, goal=1e-6)
+    campaign.add(q[:19], y[:19])
+    assert campaign.error_limit is None
+    assert not campaign.reached
+    campaign.add(q[19], y[19])
+    known, limit, model = campaign.expected_error, campaign.error_limit, campaign._model
+    assert known is not None
+    assert limit is not None
+    assert model is not None
+    assert 1.1 < limit / known < 2
+    assert not campaign.reached
+    for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
+        campaign.goal = goal
+        assert campaign.reached == (needed == 0)
+        assert campaign._next_scales(model) == pytest.approx(factor * 20)
+        found = campaign.next(1)
+        assert found is not None
+        assert needed is None or found.needed == needed
     with pytest.raises(InputError, match="goal"):
-        dc.Campaign(ARM.nominal, goal=0.0)
+        dc.Campaign(arm.nominal, goal=0.0)

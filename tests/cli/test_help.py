@@ -107,7 +107,7 @@ OPTIONS = {
         *("--tip", "--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload-mass"),
     ],
     "export": [
-        *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
+        *("MODEL", "--urdf", "--mjcf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
         *("--c", "--torch", "--onnx", "--camera", "--tool", "--tool-from", "--frame", "--payload-mass", "--tip"),
     ],
