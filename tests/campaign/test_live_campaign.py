@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.campaign.certainty import limit_of
 from diffeo_calib.campaign.posterior import Posterior, Rows
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
@@ -115,7 +116,9 @@ def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
     other = q + torch.tensor([0, 2e-3, 0, 0, 0, 0], dtype=q.dtype)
     cases = {"device": (q, y + away), ARM.nominal.joint_names[1]: (q, ARM.true_points(other))}
     for words, rows in cases.items():
-        campaign, verdicts = after(running, *(part[:8] for part in rows))
+        campaign, (verdict,) = after(running, *(part[:1] for part in rows))
+        assert verdict.change is None, "a single wrong row is no change of six unknowns some rows before"
+        verdicts = [*campaign.add(*(part[1:8] for part in rows))]
         change = next(one.change for one in verdicts[::-1] if one.change is not None)
         assert change is not None, (words, str(verdicts[-1]))
         assert words in (change.cause, *change.others)[0], (words, str(verdicts[-1]))
@@ -254,3 +257,39 @@ def test_other_kinds_of_rows(name: str) -> None:
     found = campaign.next(2)
     assert found is not None
     assert found.expected[2] < found.expected[0]
+
+
+def test_the_limit_holds_95_percent_of_errors() -> None:
+    random = torch.Generator("cpu").manual_seed(0)
+    root = torch.randn(60, 20, generator=random, dtype=torch.float64)
+    errors = (root @ torch.randn(20, 4000, generator=random, dtype=torch.float64)).square().mean(0).sqrt()
+    S = root @ root.T
+    limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
+    assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
+    assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
+
+
+def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
+    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
+    arm = SimulatedArm(3)
+    places, (q, y) = arm.sample(10, seed=8), arm.measure(20, seed=7)
+    campaign = dc.Campaign(arm.nominal, candidates=places, target=places, goal=1e-6)
+    campaign.add(q[:19], y[:19])
+    assert campaign.error_limit is None
+    assert not campaign.reached
+    campaign.add(q[19], y[19])
+    known, limit, model = campaign.expected_error, campaign.error_limit, campaign._model
+    assert known is not None
+    assert limit is not None
+    assert model is not None
+    assert 1.1 < limit / known < 2
+    assert not campaign.reached
+    for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
+        campaign.goal = goal
+        assert campaign.reached == (needed == 0)
+        assert campaign._next_scales(model) == pytest.approx(factor * 20)
+        found = campaign.next(1)
+        assert found is not None
+        assert needed is None or found.needed == needed
+    with pytest.raises(InputError, match="goal"):
+        dc.Campaign(arm.nominal, goal=0.0)
