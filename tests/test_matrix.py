@@ -125,7 +125,7 @@ class Bench:
 
 
 NUMBERED = ("line_numbers", "device", "session", "socket")
-FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared")
+FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")
 """Columns that follow from the corners of all images of a table."""
 Verb = Callable[[Bench], None]
 VERBS: dict[str, Verb] = {}
