@@ -189,7 +189,7 @@ def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
         return {name: camera[name] for name in names}
     if len(names) > 1 and isinstance(camera, Camera):
         raise MeasurementError.of("`camera`", expected=f"those of {listed(names)}", got="one camera", fix=fix)
-    found: dict[str, Known] = dict.fromkeys(names, camera)
+    found: dict[str, Any] = dict.fromkeys(names, camera)
     return found
 
 

@@ -196,7 +196,7 @@ def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> 
     (tmp_path / "right.yaml").rename(tmp_path / "rihgt.yaml")
     done = command(*words, files[0], files[1].replace("right", "rihgt"))
     assert done.code == 1
-    assert "camera ['right']" in " ".join(done.err.split())
+    assert "expected that of ['right'] too" in " ".join(done.err.split())
 
 
 def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path) -> None:
