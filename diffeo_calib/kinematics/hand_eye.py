@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -130,9 +130,9 @@ class HandEye:
 
 
 def hand_eye_entry(found: Mapping[str, HandEye]) -> dict[str, object]:
-    """Camera and board for programs; of several cameras by their names."""
-    each: dict[str, Any] = {name: own.entry() for name, own in found.items()}
-    return each if len(each) > 1 else next(iter(each.values()))
+    """Camera and board for programs; of several cameras by their names; nothing of none."""
+    each = {name: own.entry() for name, own in found.items()}
+    return {"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))
 
 
 def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:

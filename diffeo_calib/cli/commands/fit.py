@@ -99,7 +99,7 @@ def run(
     hand_eye = hand_eye_of(result)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
-    record.add(**({"hand_eye": hand_eye_entry(hand_eye)} if hand_eye else {}))
+    record.add(**hand_eye_entry(hand_eye))
     _record(result, in_train, held_out, vars(outputs))
     for line in _verdict(result, held_out or {}):
         say(line)
