@@ -6,8 +6,8 @@ import base64
 import csv
 import html
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ IMAGE, CAMERA = "image", "camera"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 THUMBNAIL = 320
 """Width of an image in the overview, pixels."""
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +95,16 @@ def page(folders: Sequence[Folder]) -> str:
     return f"<!doctype html><meta charset=utf-8><title>{head}</title><style>{style}</style><h1>{head}</h1>{cells}"
 
 
-def read_folders(folders: Sequence[Path], joints: Path, board: Board, sep: str = ",") -> list[Folder]:
+def read_folders(
+    folders: Sequence[Path], joints: Path, board: Board, sep: str = ",", progress: Progress = lambda *_: None
+) -> list[Folder]:
     """Find a board in the images of a table of joint values.
 
     Args:
         folders: of the images, one of each camera.
         joints: a table with a header; its column `image` names the file of each row, in every folder that has one;
             without this column the rows are those of the files of each folder in alphabetical order.
-        board: to look for. sep: between cells.
+        board: to look for. sep: between cells. progress: called as ``progress(task, done, total)``.
 
     Raises:
         MeasurementError: rows and images that do not belong to one another, or a folder without an image that shows the
@@ -117,21 +120,26 @@ def read_folders(folders: Sequence[Path], joints: Path, board: Board, sep: str =
         raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
     header, rows, files = _files(folders, joints, header, rows)
     each = zip(folders, names, files, strict=True)
-    return [_folder(folder, name, board, header, list(zip(own, rows, strict=True))) for folder, name, own in each]
+    found = []
+    for folder, name, own in each:
+        whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
+        found.append(_folder(folder, Folder(name, board, header, [], (0, 0)), whole, progress))
+    return found
 
 
-def _folder(
-    folder: Path, name: str, board: Board, header: list[str], files: Sequence[tuple[str | None, list[str]]]
-) -> Folder:
-    """Find the board in the files of one folder, with the cells of their rows; None has no image."""
-    known = [(file, cells) for file, cells in files if file is not None]
+def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]], progress: Progress) -> Folder:
+    """Find the board in the files of one folder, with the cells of their rows."""
+    board = empty.board
     read = [_grey(folder / file) for file, _ in known]
     sizes = Counter(image.shape for image in read if image is not None)
     if not sizes:
         raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
     usual = sizes.most_common(1)[0][0]
-    images = [_seen(*own, image, board, usual) for own, image in zip(known, read, strict=True)]
-    found = Folder(name, board, header, images, (usual[1], usual[0]))
+    images = []
+    for own, image in zip(known, read, strict=True):
+        progress("images", len(images), len(known))
+        images.append(_seen(*own, image, board, usual))
+    found = replace(empty, images=images, size=(usual[1], usual[0]))
     if not found.used:
         reasons = few([f"{one.name}: {one.refused}" for one in images])
         likely = next((word for image in read[:3] if image is not None and (word := other_dictionary(image))), None)

@@ -11,7 +11,7 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import page, read_folders
-from diffeo_calib.cli.console import say
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.options import BoardImages
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
@@ -23,7 +23,8 @@ from diffeo_calib.measurements.table_format import TableFormat
 def run(folders: Sequence[Path], joints: Path, given: BoardImages, output: Path) -> None:
     """Find the board, and write corners, cameras and overview."""
     table = TableFormat(given.length.value, "rad", given.sep, given.decimal)
-    found = read_folders(folders, joints, Board.of(given.board), table.sep)
+    with progress_bar() as progress:
+        found = read_folders(folders, joints, Board.of(given.board), table.sep, progress)
     text, several = io.StringIO(newline=""), len(found) > 1
     sheet = csv.writer(text, delimiter=table.sep)
     sheet.writerow([IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several])
