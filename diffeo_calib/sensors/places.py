@@ -91,9 +91,21 @@ def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
     """
     names, own = sessions_of(data)
     predicted = predicted[:, : data.markers]
+    check_same_markers(predicted, data.points)
     rows = [(own == place).to(predicted.device) for place in range(len(names))]
     found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
     return SessionPlaces(names, torch.stack(found))
+
+
+def check_same_markers(points: Tensor, measured: Tensor) -> None:
+    """Raise InputError for points (N, P, 3) of other markers than those that were measured."""
+    if points.shape != measured.shape:
+        raise InputError.of(
+            "the model and the measurements do not have the same markers",
+            expected=f"predictions of shape {tuple(measured.shape)}",
+            got=tuple(points.shape),
+            fix="evaluate on the markers that the model was calibrated with, in the same order",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +252,7 @@ class Places:
 
 def sensor_key(data: Readings) -> object:
     """What readings of the same kind of devices have in common."""
-    return data.kind, data.offset_std, data.intrinsics
+    return data.column_kind
 
 
 def fitting_devices(data: Readings, points: Tensor) -> Devices:
@@ -316,6 +328,10 @@ class PlacedDevices:
             torch.cat([self.device, torch.tensor(device, dtype=torch.int64, device=HOST)]),
             self.shown or other.shown,
         )
+
+    def same_set(self, other: PlacedDevices) -> bool:
+        """Whether others are of one set with these: of the same kind, and under the same names if readings are."""
+        return self.kind == other.kind and (self.devices is None or bool(set(self.names) & set(other.names)))
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor) -> PlacedDevices:
         """The same devices beside another model: those of readings read of its points what they read before.

@@ -151,12 +151,13 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
 
     Devices that the model knows and that have no rows stay where they are.
     """
-    found = {own.kind: own for own in model.placement}
+    found = list(model.placement)
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
         for own in sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach(), model.turns):
-            found[own.kind] = own.beside(found[own.kind]) if own.kind in found else own
-    return tuple(found.values())
+            same = next((number for number, old in enumerate(found) if own.same_set(old)), len(found))
+            found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or [own]
+    return tuple(found)
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:

@@ -1,0 +1,115 @@
+"""Laws that errors of every kind of measurement obey, and crossings of kinds that are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import reading_bank
+import torch
+from kind_bank import KINDS, Kind, kind_named
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+
+Lines = dict[tuple[str, int], tuple[str, Tensor]]
+Law = Callable[[Kind, Any], Any]
+
+
+def lines(model: Any, rows: Any) -> Lines:
+    """Kind and line of every row -> name of its device, and its errors."""
+    found = dc.evaluate(model, rows)
+    kinds = found.values() if isinstance(found, dict) or hasattr(found, "values") else [found]
+    each = {}
+    for one in kinds:
+        names = one.devices or [""] * len(one.errors)
+        for line, name, own in zip(one.line_numbers.tolist(), names, one.errors, strict=True):
+            each[one.kind, line] = name, own
+    return each
+
+
+LAWS: dict[str, Law] = {
+    "rows in another order": lambda kind, rows: (kind.model, rows.rows(list(reversed(range(len(rows)))))),
+    "joined of one part": lambda kind, rows: (kind.model, dc.Observations.joined([rows])),
+    "joined of two halves": lambda kind, rows: (
+        kind.model,
+        dc.Measurements.joined([rows.rows(slice(0, len(rows) // 2)), rows.rows(slice(len(rows) // 2, None))]),
+    ),
+    "parts in another order": lambda kind, rows: (kind.model, dc.Measurements.joined(rows.parts[::-1])),
+    "saved and loaded": lambda kind, rows: (dc.load(kind.file), rows),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("law", LAWS)
+def test_the_errors_do_not_change(law: str, kind: str) -> None:
+    own = kind_named(kind)
+    rows = own.new.with_line_numbers(torch.arange(len(own.new)) + 100)
+    expected, found = lines(own.model, rows), lines(*LAWS[law](own, rows))
+    assert set(found) == set(expected)
+    for key, (name, errors) in expected.items():
+        assert found[key][0] == name
+        assert_close(found[key][1], errors, rtol=0, atol=1e-9, equal_nan=True)
+
+
+# --- several devices of one kind ------------------------------------------------------------------------------------
+
+
+def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, Any, Any]:
+    """Positions, and distances of devices with and without a known zero."""
+    arm = SimulatedArm(0, markers=2)
+    q, points = arm.measure(40, seed=5)
+    tables = [reading_bank.readings(arm, "distance", 48, zero, noise=2e-5, seed=3 + bool(zero)) for zero in (0.0, 0.03)]
+    named = [
+        replace(own, names=tuple(f"{name} {number}" for number in range(3)))
+        for own, name in zip(tables, (first, second), strict=True)
+    ]
+    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), *named
+
+
+def test_devices_with_and_without_a_known_zero_are_all_known_to_the_model() -> None:
+    tables = wires()
+    data = dc.Observations.joined(tables)
+    model = dc.calibrate(SimulatedArm(0).nominal, data, hyperparameters=reading_bank.scales()).model  # pyright: ignore
+    for judged in (*tables, data):
+        assert dc.evaluate(model, judged).numbers == 0
+    names = {name for own in tables[1:] for name in own.names}
+    again = model.registered(data)  # pyright: ignore
+    assert {name for own in again.placement for name in own.names} == names
+    found: Any = dc.evaluate(again, data)
+    assert found.numbers == 0
+    assert max(one.rms for one in found.values()) < 1e-4
+
+
+def test_one_name_for_devices_of_one_kind_that_read_in_two_ways_is_refused() -> None:
+    with pytest.raises(dc.DiffeoCalibError, match=r"distances of 'wire 0', .*'wire 1'.*name"):
+        dc.Observations.joined(wires("wire", "wire"))
+
+
+def test_known_deviations_of_a_part_of_the_readings_of_a_device_are_refused() -> None:
+    _, own, _ = wires()
+    known = replace(own, std=torch.full_like(own.values, 1e-5))
+    with pytest.raises(dc.DiffeoCalibError, match=r"wire 0.*deviations"):
+        dc.Observations.joined([own, known])
+
+
+# --- crossings that are refused -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", [dc.evaluate, dc.CalibratedKinematics.registered, dc.compare, dc.recalibrate])
+def test_a_payload_at_another_link_is_refused(verb: Callable[[Any, Any], Any]) -> None:
+    kind = kind_named("payloads")
+    rows = kind.new.with_payload(kind.new.payload, at="elbow")
+    with pytest.raises(dc.DiffeoCalibError, match=f"payload.*'{kind.robot.tip}'.*'elbow'"):
+        verb(kind.model, rows)
+
+
+def test_set_ups_of_other_markers_than_those_of_the_model_are_refused() -> None:
+    with pytest.raises(dc.DiffeoCalibError, match=r"same markers.*, 2, 3.*, 1, 3"):
+        dc.evaluate(kind_named("positions").model, kind_named("sessions").new)
