@@ -113,3 +113,33 @@ def test_a_payload_at_another_link_is_refused(verb: Callable[[Any, Any], Any]) -
 def test_set_ups_of_other_markers_than_those_of_the_model_are_refused() -> None:
     with pytest.raises(dc.DiffeoCalibError, match=r"same markers.*, 2, 3.*, 1, 3"):
         dc.evaluate(kind_named("positions").model, kind_named("sessions").new)
+
+
+# --- parts of tables ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", [dc.compare, dc.recalibrate])
+@pytest.mark.parametrize("name", ["sessions", "markers mounted anew"])
+def test_rows_of_one_set_up_of_several_are_rows_of_one(name: str, verb: Callable[[Any, Any], Any]) -> None:
+    """A part of a table knows the names of all of its set-ups."""
+    kind = kind_named(name)
+    rows = kind.new.rows([own == kind.new.device_names[0] for own in kind.new.device_names])
+    found, alone = verb(kind.model, rows), verb(kind.model, rows.with_sessions(None))
+    assert_close(torch.tensor(_rms(found)), torch.tensor(_rms(alone)), rtol=1e-6, atol=1e-9)
+
+
+def _rms(found: Any) -> float:
+    return getattr(found, "after", found).rms
+
+
+def test_a_fit_whose_part_has_rows_of_one_set_up_is_a_fit_of_one() -> None:
+    kind = kind_named("sessions")
+    rows = kind.data.rows([own == "Friday" for own in kind.data.device_names])
+    model = dc.calibrate(kind.robot, rows, hyperparameters=kind.scales).model
+    assert not model.placement
+
+
+def test_errors_of_several_tips_are_a_frame() -> None:
+    kind = kind_named("several tips")
+    found: Any = dc.evaluate(kind.model, kind.new)
+    assert found.to_frame()["angle"].to_numpy().tolist() == pytest.approx(found.angles.flatten().tolist(), nan_ok=True)

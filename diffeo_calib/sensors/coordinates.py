@@ -169,7 +169,7 @@ class Positions(Sensor):
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The frames of several set-ups, or their markers; those of one are those of the model."""
-        if len(data.session_names) < 2:
+        if len(data.set_ups) < 2:
             return ()
         if data.remounted:
             own = MountedMarkers.of(points, data, turns)
