@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,10 +24,9 @@ Law = Callable[[Kind, Any], Any]
 
 def lines(model: Any, rows: Any) -> Lines:
     """Kind and line of every row -> name of its device, and its errors."""
-    found = dc.evaluate(model, rows)
-    kinds = found.values() if isinstance(found, dict) or hasattr(found, "values") else [found]
+    found: Any = dc.evaluate(model, rows)
     each = {}
-    for one in kinds:
+    for one in found.values() if isinstance(found, Mapping) else [found]:
         names = one.devices or [""] * len(one.errors)
         for line, name, own in zip(one.line_numbers.tolist(), names, one.errors, strict=True):
             each[one.kind, line] = name, own
@@ -70,7 +69,7 @@ def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, Any
         replace(own, names=tuple(f"{name} {number}" for number in range(3)))
         for own, name in zip(tables, (first, second), strict=True)
     ]
-    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), *named
+    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), named[0], named[1]
 
 
 def test_devices_with_and_without_a_known_zero_are_all_known_to_the_model() -> None:
@@ -143,3 +142,19 @@ def test_errors_of_several_tips_are_a_frame() -> None:
     kind = kind_named("several tips")
     found: Any = dc.evaluate(kind.model, kind.new)
     assert found.to_frame()["angle"].to_numpy().tolist() == pytest.approx(found.angles.flatten().tolist(), nan_ok=True)
+
+
+@pytest.mark.parametrize(("name", "set_up"), [("sessions", "Monday"), ("markers mounted anew", "b")])
+def test_a_recalibration_with_rows_of_one_set_up_knows_where_all_of_them_are(name: str, set_up: str) -> None:
+    """Its frame and markers are those of the model now; the others are where they were."""
+    kind = kind_named(name)
+    moved = kind.moved
+    own = moved.rows([name == set_up for name in moved.device_names])
+    found = dc.recalibrate(kind.model, own)
+    judged: Any = dc.evaluate(found.model, own)
+    assert judged.rms == pytest.approx(found.after.rms, rel=0.5)
+    rows = moved if kind.data.remounted else kind.new  # markers have one measuring frame, which has moved
+    for one in set(rows.device_names) - {set_up}:
+        judged = dc.evaluate(found.model, rows.rows([name == one for name in rows.device_names]))
+        assert judged.numbers == 0
+        assert judged.rms < 3e-4

@@ -333,19 +333,27 @@ class PlacedDevices:
         """Whether others are of one set with these: of the same kind, and under the same names if readings are."""
         return self.kind == other.kind and (self.devices is None or bool(set(self.names) & set(other.names)))
 
-    def carried(self, T: Tensor, before: Tensor, after: Tensor) -> PlacedDevices:
+    @property
+    def of_model(self) -> bool:
+        """Whether this is one set-up alone, whose frame and markers are those of the model."""
+        return self.kind in (SESSION, MOUNTING) and len(self.names) == 1
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> PlacedDevices:
         """The same devices beside another model: those of readings read of its points what they read before.
 
         Args:
             T: (4, 4) from the old frame to the new one, m.
             before, after: (N, P, 3) points of the old and the new model at the rows of the fit, m.
+            markers: (P, 3) old places of the markers from the new ones, in the frames of their tips, m.
         """
         if self.kind == SESSION:
             moved = self.constants.view(-1, 4, 4) @ torch.linalg.inv(T)
             return replace(self, constants=moved.flatten(1))
         if self.kind == SOCKET:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
-        if self.devices is None:  # what is on the tool
+        if self.kind == MOUNTING:
+            return replace(self, constants=self.constants + markers.flatten()[: self.constants.shape[1]])
+        if self.devices is None:
             return self
         each = [_carried(self.devices, number, before, after) for number in range(len(self.names))]
         return replace(self, constants=torch.stack(each))
