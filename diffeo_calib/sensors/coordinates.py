@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
@@ -172,10 +171,7 @@ class Positions(Sensor):
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
         names = data.set_ups
         if len(names) < 2:
-            kind, own = (MOUNTING, torch.zeros(data.markers, 3)) if data.remounted else (SESSION, torch.eye(4))
-            constants = own.to(HOST, torch.float64).expand(len(names), -1, -1).flatten(1)
-            deviations = constants[:, : constants.shape[1] * data.remounted]
-            return (PlacedDevices.outside(kind, names, constants, deviations),) if names else ()
+            return (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),) if names else ()
         if data.remounted:
             own = MountedMarkers.of(points, data, turns)
             shifts, deviations = own.shifts.flatten(1), own.deviations.flatten(1)

@@ -313,6 +313,14 @@ class PlacedDevices:
         nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
         return cls(kind, names, constants, deviations, nothing, nothing, shown)
 
+    @classmethod
+    def of_model_alone(cls, names: tuple[str, ...], mounted: int) -> PlacedDevices:
+        """The only set-up, whose frame, or markers that were mounted anew (0: none were), are those of the model."""
+        none = torch.zeros(1, 3 * mounted, dtype=torch.float64, device=HOST)
+        if mounted:
+            return cls.outside(MOUNTING, names, none, none)
+        return cls.outside(SESSION, names, torch.eye(4, dtype=torch.float64, device=HOST).view(1, 16), none)
+
     def beside(self, other: PlacedDevices) -> PlacedDevices:
         """These, and those of the same kind with other names."""
         kept = [number for number, name in enumerate(other.names) if name not in self.names]
