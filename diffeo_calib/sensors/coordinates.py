@@ -169,7 +169,7 @@ class Positions(Sensor):
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
-        names = data.set_ups
+        names = data.present_sessions
         if len(names) < 2:
             return (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),) if names else ()
         if data.remounted:
