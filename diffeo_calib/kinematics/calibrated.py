@@ -36,7 +36,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link
 from diffeo_calib.sensors.places import PlacedDevices
 
 
@@ -191,6 +191,7 @@ class CalibratedKinematics:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
         rows = registration_rows(measurements, self)
+        check_payload_link(self.nominal.load.link, measurements)
         if rows is None:
             check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
