@@ -108,7 +108,7 @@ def _following(joint: Joint) -> dict[str, str]:
 
 
 class _Links:
-    """What the URDF of a robot says about the link below each joint; nothing without a URDF."""
+    """Names and inertias of the links below each joint, from the robot's URDF; empty without one."""
 
     def __init__(self, chain: Tree) -> None:
         self._names: dict[str, str] = {}
@@ -124,7 +124,7 @@ class _Links:
         return self._names.get(joint, joint)
 
     def inertial(self, joint: str) -> dict[str, str] | None:
-        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF says nothing."""
+        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF has none."""
         element = self._inertials.get(self.name(joint))
         mass, inertia = (None if element is None else element.find(tag) for tag in ("mass", "inertia"))
         if mass is None or inertia is None:
