@@ -10,12 +10,12 @@ URDF. Meshes, actuators and contacts are not written: take these bodies' places 
 
 from __future__ import annotations
 
+from importlib import import_module
 from math import isfinite
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lxml import etree
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
@@ -28,6 +28,8 @@ from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw
 from diffeo_calib.robots.tree import BASE, Tree
 from diffeo_calib.robots.urdf_elements import xml_of
+
+etree = import_module("lxml.etree")  # compiled, without type stubs
 
 SMALLEST_MASS_KG, SMALLEST_INERTIA = 1e-3, 1e-9
 """Of bodies without <inertial>: MuJoCo refuses moving bodies without mass."""
@@ -126,7 +128,9 @@ class _Links:
     def inertial(self, joint: str) -> dict[str, str] | None:
         """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF has none."""
         element = self._inertials.get(self.name(joint))
-        mass, inertia = (None if element is None else element.find(tag) for tag in ("mass", "inertia"))
+        if element is None:
+            return None
+        mass, inertia = element.find("mass"), element.find("inertia")
         if mass is None or inertia is None:
             return None
         xyz, R = _place(element.find("origin"))
