@@ -149,7 +149,7 @@ def test_commands_run_one_after_the_other(folder: Path, command: Command, monkey
         done = command(*arguments)
         assert done.code == 0, (line, done.err)
         if real:
-            rms = [done.numbers(stage, "190 held out")[0] for stage in ("diffeomorphic", "geometry")]
+            rms = [done.numbers(stage, "190 held out")[0] for stage in ("calibrated", "geometric")]
             assert [f"{value:.3f}" for value in rms] == [found[1], found[2]]
         ran += 1
     assert ran >= 18
