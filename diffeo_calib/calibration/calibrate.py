@@ -14,7 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -172,7 +172,7 @@ def calibrate(
             placed, chosen = (drifting, again) if worth_it(chosen.left_out, again.left_out) else (placed, chosen)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
-        return _result(robot, placed, chosen, fitted, note, warned)
+        return _result(robot, placed, chosen, fitted, note=note, warned=warned)
 
 
 def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float | None]:
@@ -237,7 +237,7 @@ def _covariances(fitted: FittedMap, placed: Placed) -> FittedMap:
 
 
 def _result(
-    robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note: str, warned: list[str]
+    robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, *, note: str, warned: list[str]
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
     fitted_map = _covariances(fitted.model, placed)
@@ -257,11 +257,7 @@ def _result(
         model=CalibratedKinematics(
             robot,
             fitted_map,
-            replace(
-                _summary(rms, chosen, fitted, explained, found),
-                length_in_doubt=doubt,
-                warnings="\n".join(warned) or None,
-            ),
+            _summary(rms, chosen, fitted, explained, found, length_in_doubt=doubt, warnings="\n".join(warned) or None),
             lever=placed.lever,
             ball=placed.ball,
             placement=placed.placement.placed(),
@@ -281,7 +277,12 @@ def _result(
 
 
 def _summary(
-    rms: list[float | None], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
+    rms: list[float | None],
+    chosen: ChosenScales,
+    fitted: Fit,
+    explained: list[Part],
+    found: list[Outlier],
+    **warned: Any,
 ) -> Summary:
     """Numbers and sentences that travel with the model; ``rms`` of registration, geometry, model and left out, m."""
     registration, geometry, calibrated, left_out = rms
@@ -300,4 +301,5 @@ def _summary(
         rows=len(chosen.data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
+        **warned,
     )

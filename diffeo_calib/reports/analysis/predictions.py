@@ -90,9 +90,9 @@ class Predictions:
         squares = known(self.squares)
         return int((squares <= chi2_above(1.0 - share, 3)).sum()), len(squares)
 
-    def coverage(self) -> float:
-        """Share of errors inside the regions that claim 95 %."""
-        inside, count = self.inside()
+    def coverage(self, share: float = 0.95) -> float:
+        """Share of errors inside these regions."""
+        inside, count = self.inside(share)
         return inside / count
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
