@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from math import inf
 from reprlib import Repr
 from typing import TYPE_CHECKING
 
@@ -136,6 +137,15 @@ def shown(value: object, most: int = LONGEST_NAME) -> str:
     text = printable(value if isinstance(value, str) else " ".join(str(value).split()))
     half = (most - 3) // 2
     return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
+
+
+def with_deviation(value: float, deviation: float) -> str:
+    """A signed value with as many digits as its deviation tells: ``+1.000 +- 0.004``, ``-12 +- 3``."""
+    if not 0.0 < deviation < inf:
+        return f"{value:+.2g} +- {deviation:.2g}"
+    leading = f"{deviation:.1e}"  # 1.4e-03: two digits of a deviation that begins with 1
+    digits = max(0, (leading[0] == "1") - int(leading[4:]))
+    return f"{value:+.{digits}f} +- {deviation:.{digits}f}"
 
 
 def printable(text: str) -> str:

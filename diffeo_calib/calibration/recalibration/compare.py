@@ -14,7 +14,6 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
     check_arguments,
     place_again,
-    robot_map,
     warn_of_moved_markers,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, changed_offsets, hidden_offsets
@@ -180,8 +179,7 @@ def compare(
     usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
     usual = usual.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
     errors, expected, usual = map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual))
-    hidden = () if found is None else hidden_offsets(model.robot, before.fitted, robot_map(before.fitted), found)
-    return Comparison(found, changes, errors, expected, usual, tuple(hidden))
+    return Comparison(found, changes, errors, expected, usual, hidden_offsets(model.robot, before, changes))
 
 
 def _usual_deviation(model: CalibratedKinematics) -> float:

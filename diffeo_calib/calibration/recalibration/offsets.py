@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, TOLD_APART, Change, Changes
+from diffeo_calib.calibration.recalibration.new_set_up import Before, robot_map
+from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import PLACES
@@ -49,20 +50,24 @@ class HiddenOffset(NamedTuple):
 
     def __str__(self) -> str:
         unit = "mrad" if self.angle else "mm"
-        size = f"{1e3 * self.size:+.2g} +- {1e3 * self.deviation:.1g} {unit}"
+        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
         return (
             f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which; "
             "measure the same markers from the same place to rule one out"
         )
 
 
-def hidden_offsets(robot: Tree, fitted: FittedMap, nominal: GeometryMap, found: Registration) -> list[HiddenOffset]:
-    """Offsets that explain where a registration found device or markers.
+def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[HiddenOffset, ...]:
+    """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
 
     Args:
-        robot: with n joints. fitted, nominal: the old map, in its own place. found: where the rows put it.
+        robot: with n joints. before: the old map and the new rows. changes: of the robot, as these show them.
     """
-    S, J = _slopes(RegisteredMap(moved(fitted, nominal, found.transform), found), found.q)
+    found = before.registration
+    if found is None or changes.found:
+        return ()
+    old = before.fitted
+    S, J = _slopes(RegisteredMap(moved(old, robot_map(old), found.transform), found), found.q)
     noise = float(found.noise.diagonal().mean().sqrt())
     places = {"the measuring device has moved": (slice(0, 6), _motion(found))}
     if found.shift is not None:
@@ -83,7 +88,7 @@ def hidden_offsets(robot: Tree, fitted: FittedMap, nominal: GeometryMap, found: 
             left = total - (size / deviation) ** 2
             if unseen < HIDDEN_SHARE * noise and left < chi2_above(LEVEL, len(place) - 1):
                 hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != PRISMATIC, instead))
-    return hidden
+    return tuple(hidden)
 
 
 def _motion(found: Registration) -> Tensor:
