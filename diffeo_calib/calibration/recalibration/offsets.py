@@ -51,10 +51,7 @@ class HiddenOffset(NamedTuple):
     def __str__(self) -> str:
         unit = "mrad" if self.angle else "mm"
         size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
-        return (
-            f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which; "
-            "measure the same markers from the same place to rule one out"
-        )
+        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
 
 
 def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[HiddenOffset, ...]:

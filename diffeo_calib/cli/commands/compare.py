@@ -52,7 +52,7 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         say(line)
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
-    for line in change_lines(found.changes) if found.changes.found else str(found).split("; "):
+    for line in change_lines(found.changes) if found.changes.found else [str(found)]:
         say(line)
 
 
@@ -77,8 +77,7 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         transmissions_rad_or_m=found.transmissions,
         files={} if figure is None else {"figure": figure},
     )
-    for line in str(found).split("; the offset"):
-        say(line)
+    say(str(found))
     for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
         size = (
             f"{1e3 * change:.3f} mm" if kind == "prismatic" else f"{1e3 * change:.3f} mrad ({degrees(change):.4f} deg)"

@@ -77,8 +77,9 @@ def _found(result: Recalibration) -> list[str]:
     moved = "have moved" if shift is None else f"have moved by {1e3 * float(shift.norm(dim=1).max()):.2g} mm"
     moved += ", or the change below is in this" * bool(result.changes.found)
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
+    placed = [] if any("markers" in one.instead for one in result.hidden) else [f"the markers {markers[result.marker]}"]
     lines = [
-        f"the markers {markers[result.marker]}",
+        *placed,
         f"new rows, RMS from the old model, device and markers found anew: {result.before.rms_text}",
         f"new rows, RMS if each is predicted by the old rows and the other new ones: {result.left_out.rms_text}",
     ]
