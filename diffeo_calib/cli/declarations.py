@@ -89,7 +89,9 @@ def record_command(
     bag: Annotated[Path, typer.Argument(metavar="BAG", help="Folder of a ROS 2 bag.")],
     seen: Annotated[
         str,
-        typer.Option("--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured."),
+        typer.Option(
+            "--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured; or images."
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table to write.")],
     joints: Annotated[str, typer.Option("--joints", metavar="TOPIC", help="Joint states.")] = "/joint_states",
@@ -97,7 +99,10 @@ def record_command(
     shortest: Annotated[float, typer.Option("--shortest", min=0.01, help="Shortest stop in seconds.")] = 0.5,
     offset: Annotated[
         float | None,
-        typer.Option("--offset", help="Seconds to add to the times of --seen; by default estimated from all motions."),
+        typer.Option(
+            "--offset",
+            help="Seconds to add to the times of --seen; by default estimated from all motions, 0 for images.",
+        ),
     ] = None,
 ) -> None:
     """Turn a ROS 2 bag into a table, one row for each stop.
@@ -105,6 +110,9 @@ def record_command(
     A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
     standard deviations of what was seen (std_x, ...), its time and the number of readings. The clocks of both may
     differ. Needs the package rosbags.
+
+    Of images, the one nearest to the middle of each stop is written beside the table, which then has its name and the
+    joint values for `images`.
     """
     check_outputs({"-o": output}, {})
     from diffeo_calib.cli.commands import record  # noqa: PLC0415
