@@ -12,6 +12,7 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
+from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
@@ -65,7 +66,7 @@ def campaign_command(
     robot: options.Robot,
     units: options.Units,
     rows: options.Rows,
-    given: options.LiveOptions,
+    given: LiveOptions,
 ) -> None:
     """Judge rows while they are measured.
 
@@ -76,7 +77,12 @@ def campaign_command(
     A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
     options, the required ones too; those that are typed as well win.
     """
-    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot}, may_come="CSV")
+    bag = {} if given.bag is None else {"--bag": given.bag}
+    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot, **bag}, may_come="CSV")
+    if (given.bag is None) != (given.seen is None):
+        raise InputError.of("--bag and --seen belong together", fix="name both, or none")
+    if given.bag is not None and (given.once or given.stdin):
+        raise InputError.of("--once and --stdin beside --bag, whose end is that of the campaign", fix="leave them out")
     from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 

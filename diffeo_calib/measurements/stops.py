@@ -8,7 +8,7 @@ joints takes the one nearest to its middle: clocks that differ by less than half
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ import numpy as np
 from diffeo_calib.common.errors import MeasurementError
 
 Array = np.ndarray
+PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+"""Columns of a place and a rotation."""
 NOISE_FACTOR = 8.0
 """Range of the noise within a window, in standard deviations, that is no motion."""
 STEP_S = 0.01
@@ -108,6 +110,17 @@ def stops(
         fix = "record for longer, or allow larger motions"
         raise MeasurementError.of("stops", expected="some", got="none in which both recordings stand still", fix=fix)
     return found, offset
+
+
+def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float]]:
+    """The rows of stops: column -> value, in s, m and rad; ``names`` of the joints."""
+    rows = []
+    for one in found:
+        turn = one.seen[3:] / np.linalg.norm(one.seen[3:])
+        columns = ["time", *names, *PLACE, *TURN[: len(turn)], *(f"std_{axis}" for axis in PLACE), "readings"]
+        numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
+        rows.append(dict(zip(columns, [*map(float, numbers), one.count], strict=True)))
+    return rows
 
 
 def pictured(

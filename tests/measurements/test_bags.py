@@ -36,7 +36,7 @@ def place(q: np.ndarray) -> np.ndarray:
 @pytest.fixture
 def bag() -> Bag:
     made = Bag()
-    made.joints(*motion(50), NAMES)
+    made.joints(*motion(25), NAMES)
     return made
 
 
@@ -90,7 +90,7 @@ def test_raw_images_keep_their_pixels(bag: Bag, tmp_path: Path) -> None:
 
 
 def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, command: Command) -> None:
-    times, q = motion(20)
+    times, q = motion(10)
     bag.poses(times + 1000, place(q))
     bag.packed([], PNG)
     other, unknown, cut, zero = Bag(), Bag(), Bag(), Bag()

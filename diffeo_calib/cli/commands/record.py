@@ -7,17 +7,13 @@ import io
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
 from diffeo_calib.measurements.csv.images import IMAGE
-from diffeo_calib.measurements.stops import Stop, StopLimits, pictured, stops
-
-PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 
 
 def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, offset: float | None) -> None:
@@ -25,7 +21,7 @@ def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, of
     joints, names, seen = read_bag(bag, *topics)
     if seen.values.shape[1]:
         found, offset = stops(joints, seen, limits, offset)
-        table = table_of(names, found)
+        table = rows_of(names, found)
         write_whole(output, _text(table))
         say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {topics[1]}")
         rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
@@ -40,17 +36,6 @@ def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, of
         say(f"{len(found)} images of stops written beside {shown(output)}{left}")
         say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")
     record.add(rows=len(found), clock_offset_s=offset, files={"table": output})
-
-
-def table_of(names: list[str], found: list[Stop]) -> list[dict[str, float]]:
-    """The rows of stops: column -> value, in m, rad and s."""
-    rows = []
-    for one in found:
-        turn = one.seen[3:] / np.linalg.norm(one.seen[3:])
-        columns = ["time", *names, *PLACE, *TURN[: len(turn)], *(f"std_{axis}" for axis in PLACE), "readings"]
-        numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
-        rows.append(dict(zip(columns, [*map(float, numbers), one.count], strict=True)))
-    return rows
 
 
 def _write_images(bag: Path, topic: str, folder: Path, times: list[float]) -> dict[float, str]:
