@@ -357,8 +357,8 @@ def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
     """
     resting = table.sockets is not None
     if resting and table.sockets.distances:
-        fix = "calibrate without the images or poses to use them"
-        warn_user(sentence("known distances between sockets are not used beside measured poses", fix=fix))
+        fix = "calibrate without the images to use them"
+        warn_user(sentence("known distances between sockets are not used beside images of a board", fix=fix))
     found = []
     for marker, name in enumerate(table.marker_names or range(1, table.markers + 1)):
         rows = torch.arange(len(table), device=HOST) if resting else table.visible[:, marker].nonzero()[:, 0].cpu()

@@ -243,17 +243,17 @@ class Measurements(ImageTable, SocketTable):
         """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
 
         These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
-        then the last marker. Rows of other kinds become :class:`Observations`. Beside poses, and images of a board,
-        positions and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
+        then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
+        and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
         """
         return joined_tables(parts)
 
-    def beside_poses(self) -> list[tuple[Any, Tensor]]:
+    def beside_images(self) -> list[tuple[Any, Tensor]]:
         """See :class:`RowTable`; poses stay."""
-        return super().beside_poses() if self.lever is not None else as_readings(self)
+        return super().beside_images() if self.lever is not None else as_readings(self)
 
     @property
     def covariance(self) -> Tensor | None:

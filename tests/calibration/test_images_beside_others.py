@@ -18,6 +18,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.kinematics.evaluation import rows_of_other_frames
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -117,6 +118,13 @@ def test_the_tracker_alone_is_judged() -> None:
     found: Any = dc.evaluate(kind().model, marker)
     assert (found.count, found.unit) == (len(marker), "m")
     assert found.rms < 2e-4
+
+
+def test_no_row_is_said_to_be_of_another_set_up() -> None:
+    assert rows_of_other_frames(kind().model, kind().data.q) == 0
+    sessions = kind_named("sessions")
+    smaller = min(map(sessions.data.device_names.count, sessions.data.session_names))
+    assert rows_of_other_frames(sessions.model, sessions.data.q) == smaller
 
 
 # --- sockets beside images ------------------------------------------------------------------------------------------
