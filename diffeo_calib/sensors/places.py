@@ -348,7 +348,7 @@ class PlacedDevices:
 
     @property
     def rows_elsewhere(self) -> Tensor:
-        """(K,) rows of the fit that were measured in another set-up than the model's, whose frame and markers it has."""
+        """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
         if self.kind not in (SESSION, MOUNTING):
             return self.rows[:0]
         eye = torch.eye(4, dtype=self.constants.dtype, device=self.constants.device).flatten()
