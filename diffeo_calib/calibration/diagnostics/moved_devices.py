@@ -80,12 +80,19 @@ class Cause(NamedTuple):
         name: in words. effects: (N, m, U) derivatives of all rows by the unknowns, m.
         unit: in which a single unknown is reported, and its size in m or rad; None to report the motion of the points.
         fix: what to do about a sudden change.
+        basis: (N, c, m) the coordinates of the rows' points by their numbers, see :attr:`TangentData.basis`, or None.
     """
 
     name: str
     effects: Tensor
     unit: tuple[str, float] | None = None
     fix: str = NEW_SET_UP
+    basis: Tensor | None = None
+
+    def told_by(self, data: TangentData) -> Cause:
+        """The same with effects on the numbers that the rows tell, of effects on all coordinates."""
+        basis = data.basis
+        return self if basis is None else self._replace(effects=basis.mT @ self.effects, basis=basis)
 
 
 class ChangePoint(NamedTuple):
@@ -130,7 +137,8 @@ class Finding(NamedTuple):
         """RMS motion of a coordinate by the change over the rows that show it, m."""
         moved = (self.columns @ self.point.change).square().sum(1)
         shown = moved > 0
-        return float((moved[shown].mean() / self.columns.shape[1]).sqrt()) if bool(shown.any()) else 0.0
+        count = self.columns.shape[1] if self.cause.basis is None else self.cause.basis.shape[1]
+        return float((moved[shown].mean() / count).sqrt()) if bool(shown.any()) else 0.0
 
     def chance(self, limits: ChangeLimits) -> float:
         """Probability that chance alone gains as much."""
@@ -151,8 +159,10 @@ class Finding(NamedTuple):
 
     def _moved(self, limits: ChangeLimits) -> tuple[str, float]:
         """What moved, and how far, m."""
-        size = 3 if self.point.motion.shape[1] % 3 == 0 else self.point.motion.shape[1]
-        distances = self.point.motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
+        motion, basis = self.point.motion, self.cause.basis
+        motion = motion if basis is None else (basis @ motion[:, :, None])[:, :, 0]
+        size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
+        distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
         shown = distances.amax(1) > 0
         typical = distances[shown].median(0).values
         if self.cause.name != MARKERS:
@@ -183,13 +193,14 @@ def change_during(
     rows, some = data.sample(len(data.x), limits.coordinates, seed)
     if len(rows) < 4 * limits.fewest_rows:
         return None
+    noise = float(some.new_noise(scales).diagonal().mean().sqrt())
     causes = [one._replace(effects=one.effects[rows]) for one in (*causes_of(data), *devices())]
-    causes = [one for one in causes if bool((one.effects != 0).any())]
+    causes = [one.told_by(some) for one in causes if bool((one.effects != 0).any())]
+    some = some.told
     order, dense = numbers.to(rows.device)[rows].argsort(), some.factorised(scales)
     ratio = left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)
     excess = max(1.0, float(ratio.nanmedian()))  # of errors that the scales understate
     found = findings(causes, dense, some.target, order, excess=excess, limits=limits)
-    noise = float(some.new_noise(scales).diagonal().mean().sqrt())
     found = [one for one in found if one.displacement > limits.noise_share * noise]
     if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
         return None

@@ -161,7 +161,7 @@ def log_posterior(
     Returns:
         None where G + R, or the noise by itself, is not positive definite in float64.
     """
-    point = logarithms.detach().clone().requires_grad_()
+    data, point = data.told, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         terms = data.covariance_terms(centre.from_logarithms(point), data.present)
     try:

@@ -29,7 +29,6 @@ from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
-from diffeo_calib.common.quantiles import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye
@@ -257,7 +256,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         say(line)
     left_out, fitted = result.leave_one_out, result.fit
     if left_out.effective is not None:
-        say(f"effective number of parameters: {left_out.effective:.0f} of {len(known(left_out.errors))} coordinates")
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
     say(result.status)
     say(
         f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
