@@ -10,6 +10,7 @@ import os
 import re
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process that a test starts compiles the package
 
 
 from pathlib import Path
@@ -72,7 +73,10 @@ def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
-BY_KIND = ("test_matrix.py", "test_kinds_judged.py", "test_campaign.py")
+BY_KIND = (
+    *("test_matrix.py", "test_kinds_judged.py", "test_campaign.py", "test_live_campaign.py", "test_expected_errors.py"),
+    *("test_registered_kinds.py", "test_predicted_readings.py"),
+)
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,

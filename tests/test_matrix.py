@@ -15,19 +15,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import torch
 from command_bank import Command, Outcome, leave_undrawn
-from kind_bank import KINDS, POSITIONED, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
+from kind_bank import FREE, KINDS, POSITIONED, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.cli import record
 from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.sensors import TableColumns
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
+SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))
 NEW_ROWS_FACTOR = 1.6
 """A model of fewer or of newly placed rows may be worse than that of the fit by this factor."""
 EXPECTED_FACTOR = 2.5
@@ -46,6 +49,7 @@ WHAT = {
 }
 """What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
 SHOWN = {"m": "mm"}
+COORDINATES = ("dx", "dy", "dz")
 TITLES = {"errors": "Position errors", "spread": "Spread within sockets"}
 
 
@@ -64,7 +68,7 @@ class Bench:
     @property
     def mass(self) -> list[str]:
         """The option of commands that need one payload."""
-        return ["--payload", "4"] * (self.kind.name == "payloads")
+        return ["--payload-mass", "4"] * (self.kind.name == "payloads")
 
     @property
     def one_tip(self) -> list[str]:
@@ -83,7 +87,7 @@ class Bench:
         """The results of a command for programs."""
         path = self.folder / "results.json"
         self.run(*words, "--json", path)
-        return json.loads(path.read_text(encoding="utf-8"))["results"]
+        return results(path)
 
     def fit(self, *more: object) -> dict[str, Any]:
         """`fit` of all rows, whose calibration is that of the bank."""
@@ -98,8 +102,7 @@ class Bench:
     def judged(self, *words: object) -> dict[str, Any]:
         """The same of a command that tells errors: of every kind in its own unit, in the text and in the JSON."""
         path = self.folder / "judged.json"
-        said = self.run(*words, "--json", path).out
-        found = json.loads(path.read_text(encoding="utf-8"))["results"]
+        said, found = self.run(*words, "--json", path).out, results(path)
         own = WHAT.get(self.kind.name, {("errors", "m")})
         shown = {(what, SHOWN.get(unit, unit)) for what, unit in own}
         leaves = {kind: list(_leaves(entry)) for kind, entry in found["kinds"].items()}
@@ -112,10 +115,6 @@ class Bench:
             assert f"{title} in {unit}" in text or re.search(rf"{kind} [\d.]+ {unit}", text), (kind, text)
         return found
 
-    def evaluate(self, *more: object) -> dict[str, Any]:
-        path, options = self.kind.table("new")
-        return self.judged("evaluate", self.kind.file, path, *options, *more)
-
     def joints(self, count: int = 4) -> Path:
         """A table of joint values in deg."""
         path, names = self.folder / "joints.csv", self.kind.robot.joint_names
@@ -124,6 +123,15 @@ class Bench:
         return path
 
 
+def results(path: Path) -> dict[str, Any]:
+    """Those of a file for programs, which is as the schema says."""
+    written = json.loads(path.read_text(encoding="utf-8"))
+    jsonschema.validate(written, SCHEMA)
+    return written["results"]
+
+
+THROUGHOUT = ("positions", "several kinds")
+"""Kinds that every verb calibrates for itself. The rows of the others are compared with those of a calibration."""
 NUMBERED = ("line_numbers", "device", "session", "socket")
 FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared")
 """Columns that follow from the corners of all images of a table."""
@@ -165,6 +173,19 @@ def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1
     assert kind.error_mm(loaded(q), q) < factor * kind.source.worst_mm
 
 
+def check_same_rows(found: Any, rows: Any) -> None:
+    """But for the last digits that a table does not hold."""
+    assert_close(found.q, rows.q, rtol=0, atol=1e-12)
+    assert found.device_names == rows.device_names
+    assert [part.kind for part in found.parts] == [part.kind for part in rows.parts]
+    for one, other in zip(found.parts, rows.parts, strict=True):
+        for name, values in other.columns.items():
+            if name == "corners":  # padding is not written
+                assert_close(finite(one.columns[name]), finite(values), rtol=0, atol=1e-9)
+            elif name not in NUMBERED and not (name in FROM_IMAGES and other.corners is not None):
+                assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
+
+
 def evaluations(found: Any) -> list[Any]:
     """Those of every kind of row."""
     return list(found.values()) if isinstance(found, Mapping) else [found]
@@ -188,11 +209,14 @@ def _(bench: Bench) -> None:
 
 @verb("fit")
 def _(bench: Bench) -> None:
-    """By the command line, a fifth of the rows held out."""
+    """By the command line, a fifth of the rows held out; most kinds are calibrated with these rows once, in Python."""
     kind, path = bench.kind, bench.folder / "fit.safetensors"
 
-    def calibrate(*table: Any, **options: Any) -> Any:
-        return dc.calibrate(*table, **{**options, "hyperparameters": kind.scales})
+    def calibrate(robot: dc.Tree, rows: Any, **options: Any) -> Any:
+        assert robot.joint_names == kind.robot.joint_names
+        check_same_rows(rows, kind.part)
+        given = {**options, "hyperparameters": kind.scales}
+        return dc.calibrate(robot, rows, **given) if kind.name in THROUGHOUT else kind.of_part
 
     bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", calibrate)
     csv_file, options = kind.table()
@@ -200,30 +224,19 @@ def _(bench: Bench) -> None:
     bench.run("fit", *table, "--holdout", "0.2", "-o", path)
     model: Any = dc.load(path)
     check_accuracy(kind, model, NEW_ROWS_FACTOR)
-    assert model.summary.rows < len(kind.data)
+    assert model.summary.rows == len(kind.part)
 
 
-@verb("fit --json")
+@verb("fit --json --report --figure")
 def _(bench: Bench) -> None:
-    found = bench.fit()
+    page, figure = bench.folder / "report.html", bench.folder / "figure.svg"
+    leave_undrawn(bench.command.monkeypatch)  # tests/cli/test_kinds_judged.py draws them
+    found = bench.fit("--report", page, "--figure", figure)
     assert {"status", "errors", "files", "parts", "outliers", "leave_one_out_rms_m"} <= set(found)
     assert set(found["leave_one_out"]) == set(found["kinds"])
     assert (found["leave_one_out_rms_m"] is None) == (not found["errors"])
-
-
-@verb("fit --report")
-def _(bench: Bench) -> None:
-    path = bench.folder / "report.html"
-    leave_undrawn(bench.command.monkeypatch)  # "report" draws them
-    bench.fit("--report", path)
-    assert "<svg" in path.read_text(encoding="utf-8")
-
-
-@verb("fit --figure")
-def _(bench: Bench) -> None:
-    path = bench.folder / "figure.svg"
-    bench.fit("--figure", path)
-    text = path.read_text(encoding="utf-8")
+    assert "<svg" in page.read_text(encoding="utf-8")
+    text = figure.read_text(encoding="utf-8")
     assert "<svg" in text
     if bench.kind.name == "ball in sockets":
         assert "spread" in text.lower()
@@ -241,39 +254,34 @@ def _(bench: Bench) -> None:
         assert 0.0 < one.rms < math.inf
     said = {(getattr(one, "what", "errors"), getattr(one, "unit", "m")) for one in found}
     assert said == WHAT.get(kind.name, {("errors", "m")})
-    if kind.name not in ("ball in sockets", "distances", "heights", "images"):
+    if kind.name not in FREE:
         assert 1e3 * found[0].rms < 2 * kind.source.worst_mm
 
 
-@verb("evaluate")
+@verb("evaluate --residuals --fail-above")
 def _(bench: Bench) -> None:
-    found = bench.evaluate()
-    assert "rms" in json.dumps(found)
-    if bench.kind.name in POSITIONED or bench.kind.name in WITH_POSES:
-        assert found["errors"]["all"]["rows"] == len(bench.kind.new)
-
-
-@verb("evaluate --residuals")
-def _(bench: Bench) -> None:
-    path = bench.folder / "residuals.csv"
-    bench.evaluate("--residuals", path)
+    """The numbers are those of Python."""
+    kind, path = bench.kind, bench.folder / "residuals.csv"
+    enough, too_little = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
+    table, options = kind.table("new")
+    found = bench.judged("evaluate", kind.file, table, *options, "--residuals", path, "--fail-above", enough)
+    assert found["accepted"]
+    own = dc.evaluate(kind.model, kind.new)
+    for one in evaluations(own):
+        entry = found["kinds"][one.kind]["all"]
+        assert (entry["what"], entry["unit"]) == (one.what, one.shown[0])
+        if kind.name != "images of a board":  # whose poses follow from all corners of a table
+            assert entry["rms"] == pytest.approx(one.shown[1] * one.rms, rel=1e-3)
+    if kind.name in POSITIONED or kind.name in WITH_POSES:
+        assert found["errors"]["all"]["rows"] == len(kind.new)
     rows = table_rows(path)
-    assert len({row["line"] for row in rows}) == len({int(line) for line in bench.kind.new.lines}) or len(rows) > 0
-    if bench.kind.name in WITH_POSES:
-        assert {"rad", "deg", "mrad"} & {cell for row in rows for cell in (*row, *row.values())} or "turn" in str(
-            rows[0]
-        )
-    if bench.kind.name in ("distances", "heights", "images", "several kinds"):
-        assert "unit" in rows[0]
-
-
-@verb("evaluate --fail-above")
-def _(bench: Bench) -> None:
-    kind = bench.kind
-    units = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
-    for limit, code in zip(units, (0, 4), strict=True):
-        path, options = kind.table("new")
-        bench.run("evaluate", kind.file, path, *options, "--fail-above", limit, code=code)
+    assert list(rows[0]) == ["line", "used_in_fit", "kind", "device", "marker", *COORDINATES, "size", "unit"]
+    assert {row["kind"] for row in rows} - {"orientation"} == set(found["kinds"])
+    assert len({row["line"] for row in rows}) == len(kind.new)
+    if kind.name in WITH_POSES:
+        assert {"rad", "deg", "mrad"} & {row["unit"] for row in rows}
+    said = " ".join(bench.run("evaluate", kind.file, table, *options, "--fail-above", too_little, code=4).out.split())
+    assert ("expected over the joint ranges" in said) == (kind.name in FREE and kind.name != "images")  # px
 
 
 # --- where the device stands ----------------------------------------------------------------------------------------
@@ -321,12 +329,12 @@ def _(bench: Bench) -> None:
 
 @verb("report")
 def _(bench: Bench) -> None:
+    """Of the rows of the fit, each predicted by all others; tests/cli/test_kinds_judged.py draws those of new rows."""
     kind, path = bench.kind, bench.folder / "report.html"
-    dc.write_report(kind.model, path)
-    assert "<svg" in path.read_text(encoding="utf-8")
-    leave_undrawn(bench.command.monkeypatch)  # tests/cli/test_kinds_judged.py draws those of new rows
-    table, options = kind.table("new")
-    bench.run("report", kind.file, "-o", path, "--data", table, *options)
+    leave_undrawn(bench.command.monkeypatch)
+    table, options = kind.table()
+    found = bench.json("report", kind.file, "-o", path, "--data", table, *options)
+    assert found["left_out"]
     assert "<svg" in path.read_text(encoding="utf-8")
 
 
@@ -337,18 +345,13 @@ def _(bench: Bench) -> None:
     found = dc.plan(kind.model, kind.data.q if resting else kind.q(30), 3)
     assert found.q.shape == (3, kind.robot.n)
     assert 0.0 < float(found.expected_rms[-1]) < float(found.expected_rms[0])
-    results = bench.json(
+    planned = bench.json(
         *("plan", kind.file, "-n", "3", *(["--candidates", kind.table()[0]] if resting else ["--draw", "40"])),
         *(*UNITS, "-o", path),
     )
     assert len(table_rows(path)) == 3
-    assert len(results["expected_rms_m"]) == 4
-    assert "tracker" not in json.dumps(results) or kind.name not in (
-        "ball in sockets",
-        "distances",
-        "heights",
-        "images",
-    )
+    assert len(planned["expected_rms_m"]) == 4
+    assert "tracker" not in json.dumps(planned) or kind.name not in FREE
 
 
 @verb("correct")
@@ -367,6 +370,7 @@ def _(bench: Bench) -> None:
     kind = bench.kind
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.compare.compare", lambda *_, **__: found)
     table, options = kind.table("moved")
     bench.judged("compare", kind.file, table, *options)
 
@@ -374,7 +378,7 @@ def _(bench: Bench) -> None:
 @verb("compare two models")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    found: Any = dc.compare(kind.model, kind.other, count=100)
+    found: Any = dc.compare(kind.model, kind.of_part.model, count=100)
     assert 0.0 < found.rms < EXPECTED_FACTOR * found.expected
 
 
@@ -438,6 +442,14 @@ def _(bench: Bench) -> None:
 @verb("DiffeoRegressor")
 def _(bench: Bench) -> None:
     kind, data = bench.kind, bench.kind.data
+
+    def calibrate(robot: dc.Tree, rows: Any, *, hyperparameters: Any, **_: Any) -> Any:
+        assert (robot, hyperparameters) == (kind.robot, kind.scales)
+        check_same_rows(rows, data)
+        return kind.result
+
+    if kind.name not in THROUGHOUT:
+        bench.command.monkeypatch.setattr("diffeo_calib.interop.sklearn.calibrate", calibrate)
     plain = isinstance(data, dc.Measurements) and kind.name in ("positions", "hidden markers")
     found = dc.interop.DiffeoRegressor(kind.robot, hyperparameters=kind.scales)
     found.fit(data.q.numpy(), data.points.flatten(1).numpy() if plain else data)
@@ -451,21 +463,13 @@ def _(bench: Bench) -> None:
     same: Any = read_observations(path, columns, table)
     assert isinstance(columns, TableColumns)
     assert type(same) is type(kind.data)
-    assert_close(same.q, kind.data.q, rtol=0, atol=1e-12)
-    assert same.device_names == kind.data.device_names
-    assert [part.kind for part in same.parts] == [part.kind for part in kind.data.parts]
-    for one, other in zip(same.parts, kind.data.parts, strict=True):
-        for name, values in other.columns.items():
-            if name == "corners":  # padding is not written
-                assert_close(finite(one.columns[name]), finite(values), rtol=0, atol=1e-9)
-            elif name not in NUMBERED and not (name in FROM_IMAGES and other.corners is not None):
-                assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
+    check_same_rows(same, kind.data)
 
 
 # --- the table ------------------------------------------------------------------------------------------------------
 
-LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
-"""Verbs of seconds: but for positions and the table of several kinds they are slow tests."""
+LONG = ("fit", "fit --json --report --figure", "report", "compare two models", "recalibrate")
+"""Verbs of seconds: but for the kinds of THROUGHOUT they are slow tests."""
 
 PAIRS = [(verb, kind) for verb in VERBS for kind in KINDS]
 
@@ -484,7 +488,7 @@ def outcome(bench: Bench, name: str) -> str:
 
 
 def parameter(name: str, kind: str) -> Any:
-    slow = name in LONG and kind not in ("positions", "several kinds")
+    slow = name in LONG and kind not in THROUGHOUT
     return pytest.param(name, kind, id=f"{name}-{kind}", marks=[pytest.mark.slow] * slow)
 
 

@@ -27,6 +27,7 @@ from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import Coordinates, divided, measured_positions
 
@@ -258,9 +259,15 @@ def _causes(model: CalibratedKinematics, some: Measurements, errors: Evaluation)
 
 
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:
-    """The measured positions of a table in the frame of a model, with its markers; None if none was measured."""
-    own = measured_positions(data)
-    return None if own is None else sensor_of(own).with_points(places.aligned(own), model)
+    """The measured positions of a table in the frame of a model, with its markers; None if none was measured.
+
+    A drift that the model knows is undone.
+    """
+    own, drift = measured_positions(data), KnownDrift.of(model)
+    if own is None:
+        return None
+    own = places.aligned(own)
+    return sensor_of(own).with_points(own if drift is None else drift.aligned(own), model)
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:

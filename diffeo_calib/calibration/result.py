@@ -27,6 +27,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import with_positions
 
@@ -192,4 +193,7 @@ def errors_by_kind(result: CalibrationResult, data: Any) -> dict[str, KindErrors
 def _rows(result: CalibrationResult, data: Any, errors: Any, kind: str) -> Any:
     """The rows of a kind as a table of their own."""
     (own,) = data.rows(errors.index[kind].tolist()).parts
-    return result.aligned(own.device_rows()) if errors[kind] is errors.positions else own
+    if errors[kind] is not errors.positions:
+        return own
+    seen, drift = result.aligned(own.device_rows()), KnownDrift.of(result.model)
+    return seen if drift is None else drift.aligned(seen)

@@ -78,6 +78,7 @@ class Campaign:
         self.table: Any = None
         self.verdicts: list[Verdict] = []
         self.models = 0
+        self._lines: list[int] = []
         self._model: CampaignModel | None = None
         self._made: list[CampaignModel] = []
         self._maker: Thread | None = None
@@ -118,9 +119,9 @@ class Campaign:
         table = q_or_table if y is None else _positions(q_or_table, y)
         check_arguments(self.robot, table, None)
         start = len(self)
-        numbered: Any = table
-        numbered = numbered.with_line_numbers(torch.arange(start, start + len(numbered), device=HOST))
+        numbered, lines = self._numbered(table)
         whole = numbered if self.table is None else joined_tables([self.table, numbered])
+        self._lines += lines
         for row in range(start, len(whole)):
             self.table = whole.rows(slice(0, row + 1))
             self._add(row)
@@ -132,9 +133,8 @@ class Campaign:
         check_arguments(self.robot, table, None)
         if len(self) or len(table) != len(verdicts):
             raise InputError.of("`verdicts`", expected=f"{len(table)}, of a new campaign", got=str(len(verdicts)))
-        rows: Any = table
-        self.table = rows.with_line_numbers(torch.arange(len(rows), device=HOST))
-        self.verdicts = list(verdicts)
+        self.table, self._lines = self._numbered(table)
+        self.verdicts = [replace(one, line=line) for one, line in zip(verdicts, self._lines, strict=True)]
         self._renew()
 
     def accept(self, row: int) -> None:
@@ -187,7 +187,7 @@ class Campaign:
         """Judge one row of the table, and renew the model if it is due."""
         self.poll()
         if self._model is None:
-            self.verdicts.append(Verdict(row, None, accepted=True))
+            self.verdicts.append(Verdict(row, None, accepted=True, line=self._lines[row]))
         else:
             self._judge(self._model, self.table)
         self._renew()
@@ -195,6 +195,13 @@ class Campaign:
         for one in self.verdicts[:row]:
             if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
                 self.verdicts[one.row] = replace(one, again=False)
+
+    def _numbered(self, table: Any) -> tuple[Any, list[int]]:
+        """New rows, numbered in the campaign, and their lines, which go on after those before."""
+        lines, last = table.line_numbers, max(self._lines, default=-1)
+        shift = last + 1 - int(lines.min()) if len(lines) and int(lines.min()) <= last else 0
+        start = len(self._lines)
+        return table.with_line_numbers(torch.arange(start, start + len(table), device=HOST)), (lines + shift).tolist()
 
     def _decide(self, row: int, *, accepted: bool, again: bool = False) -> None:
         if row not in range(len(self)):
@@ -266,9 +273,10 @@ class Campaign:
     def _judge(self, model: CampaignModel, table: Any) -> None:
         """Add the verdict about the last row of a table."""
         try:
-            model.judge(table, self.verdicts)
+            model.judge(table, self.verdicts, self._lines)
         except DiffeoCalibError as error:  # a device that has no place yet
-            self.verdicts.append(Verdict(len(table) - 1, None, accepted=True, cause=str(error)))
+            row = len(table) - 1
+            self.verdicts.append(Verdict(row, None, accepted=True, cause=str(error), line=self._lines[row]))
 
 
 def _positions(q: object, y: object) -> Measurements:

@@ -146,8 +146,11 @@ class CampaignModel:
         cross = self.posterior.between(self.last)[mine, :size]
         return whole - cross.T @ torch.linalg.solve(self.last.covariance[mine][:, mine], cross)
 
-    def judge(self, table: Any, verdicts: list[Verdict]) -> None:
+    def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
         """Judge the last row of a table, add its verdict, and take in the row that leaves the window.
+
+        Args:
+            lines: of all rows, see :attr:`Verdict.line`.
 
         Raises:
             MeasurementError: a device that is not known.
@@ -169,9 +172,10 @@ class CampaignModel:
             self.ratios.append(found.ratio)
         cause = "" if fits else self._cause(table, around.data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
-        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown))
+        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
         change = None if cause else self._change(around, seen, verdicts, typical)
         if change is not None:
+            change = replace(change, line=lines[change.row])
             for number in self.window:
                 own, before = verdicts[number], number < change.row
                 if own.change is not None or not (before or own.cause or own.decided):

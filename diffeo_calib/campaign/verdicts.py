@@ -64,7 +64,7 @@ class Change:
 
     Args:
         row: number of the first row after it. cause: in words. size: in ``unit``. others: causes that explain as much.
-        fix: what to do.
+        fix: what to do. line: of the row, see :class:`Verdict`.
     """
 
     row: int
@@ -73,10 +73,11 @@ class Change:
     unit: str
     others: tuple[str, ...] = ()
     fix: str = ""
+    line: int = 0
 
     def __str__(self) -> str:
         others = "".join(f", or {name}" for name in self.others)
-        by = f"{self.size:.2g} {self.unit} before row {self.row}"
+        by = f"{self.size:.2g} {self.unit} before row {self.line}"
         return f"{self.cause}{others} has changed by about {by}; {self.fix}"
 
 
@@ -85,13 +86,15 @@ class Verdict:
     """What a campaign thinks of a row.
 
     Args:
-        row: its number. fits: whether it is where the accepted rows before it predict it; None if they could not yet.
+        row: its number in the campaign, from 0.
+        fits: whether it is where the accepted rows before it predict it; None if they could not yet.
         accepted: whether it was taken in.
         error: how far it is from its prediction, m at the tool: RMS of its numbers. expected: the same as expected.
         cause: the likely cause of a wrong row, in words. change: what changed before it or before earlier rows.
         expected_error: error of the robot over the target after this row, m; None before the first model.
         decided: whether the user accepted or rejected it. again: whether its pose is to be measured again.
         shown: unit in which errors of its kind are shown, and how many of it are a metre at the tool.
+        line: number by which texts name the row: its line in the file, see :attr:`Measurements.line_numbers`.
     """
 
     row: int
@@ -105,24 +108,26 @@ class Verdict:
     decided: bool = False
     shown: tuple[str, float] = ("mm", 1e3)
     again: bool = False
+    line: int = 0
 
     def __str__(self) -> str:
         again = "; to be measured again" * self.again
         if self.fits is None:
-            return f"row {self.row}: not judged yet{self.cause and f' ({self.cause})'}{again}"
+            return f"row {self.line}: not judged yet{self.cause and f' ({self.cause})'}{again}"
         unit, per_metre = self.shown
         size = (
             f"{per_metre * self.error:.3g} {unit} from its prediction, {per_metre * self.expected:.2g} {unit} are usual"
         )
         how = "fits" if self.fits and self.change is None else "looks wrong"
-        text = f"row {self.row} {how}: {size}{self.cause and f'; {self.cause}'}{again}"
+        text = f"row {self.line} {how}: {size}{self.cause and f'; {self.cause}'}{again}"
         return text if self.change is None else f"{text}; {self.change}"
 
     def entry(self) -> dict[str, Any]:
         """The same for programs: lengths in mm, and the sentence."""
-        same = {name: getattr(self, name) for name in ("row", "fits", "accepted", "cause")}
+        same = {name: getattr(self, name) for name in ("line", "fits", "accepted", "cause")}
         sizes = {"error_mm": 1e3 * self.error, "usual_mm": 1e3 * self.expected}
-        return same | sizes | {"change": self.change and asdict(self.change), "text": str(self)}
+        change = None if self.change is None else {k: v for k, v in asdict(self.change).items() if k != "row"}
+        return same | sizes | {"change": change, "text": str(self)}
 
 
 class Measure(NamedTuple):

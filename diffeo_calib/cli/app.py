@@ -17,12 +17,21 @@ from typer.core import TyperGroup
 
 from diffeo_calib.cli import campaign
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
-from diffeo_calib.common.errors import printable
+from diffeo_calib.common.errors import printable, warn_user
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
+MASS, FREEDOM = {"--payload": "--payload-mass"}, {"--marker": "--marker-freedom"}
+RENAMED = {
+    **{"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}},
+    **{"recalibrate": FREEDOM, "compare": FREEDOM},
+}
+"""Command -> former names of options, which had another meaning in other commands, and their names."""
+
 _arguments: list[str] = []
 """Of the command that runs."""
+_renamed: list[str] = []
+"""What to say about former names among them."""
 
 
 def command_line() -> str:
@@ -56,7 +65,7 @@ class FlagsOff(TyperGroup):
         )
         if (several := campaign.asked(args, options_of_fit)) is not None:
             raise typer.Exit(campaign.run(several))
-        _arguments[:] = campaign.expanded(args, options_of_fit, of_campaign)
+        _arguments[:], _renamed[:] = _with_names(campaign.expanded(args, options_of_fit, of_campaign))
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -65,10 +74,24 @@ class FlagsOff(TyperGroup):
         """Run a command; a bad value is named without typer's own words, and without control characters."""
         try:
             with record.written(list(_arguments)):
+                for text in _renamed:
+                    warn_user(text)
                 return super().invoke(ctx)
         except typer.BadParameter as error:
             error.message = printable(error.message.removeprefix("Value error, "))
             raise
+
+
+def _with_names(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The words with the names of options in the place of former ones, and what to say about these."""
+    command = next((word for word in words if not word.startswith("-")), "")
+    found, said, names = list[str](), list[str](), RENAMED.get(command, {})
+    for word in words:
+        name, equal, value = word.partition("=")
+        if name in names:
+            said.append(f"{name} of `{command}` is called {names[name]} now; {name} will be removed")
+        found.append(names.get(name, name) + equal + value)
+    return found, said
 
 
 app = typer.Typer(

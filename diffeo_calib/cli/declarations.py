@@ -257,7 +257,7 @@ def plan_command(
     later. Lengths are in the unit of --length, angles in that of --angle; tables have the columns that `fit` reads.
     """
     inputs = {"MODEL": model, "--robot": given.robot, "--candidates": cell.candidates}
-    inputs |= {"--target": given.target, "--measured": given.measured}
+    inputs |= {"--target-poses": given.target_poses, "--measured": given.measured}
     check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
     _check_belonging(model, given)
     _check_draw(cell)
@@ -278,8 +278,10 @@ def _check_belonging(model: Path | None, given: options.Planned) -> None:
         if missing:
             expected = "a MODEL, or --robot with --base and --tip"
             raise InputError.of("what to plan for", expected=expected, got=f"no {', '.join(missing)}")
-        if given.payload is not None:
-            raise InputError.of("--payload without a MODEL", fix="leave it out: no sag under a payload is known yet")
+        if given.payload_mass is not None:
+            raise InputError.of(
+                "--payload-mass without a MODEL", fix="leave it out: no sag under a payload is known yet"
+            )
         if given.free is not None:
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
 

@@ -32,6 +32,11 @@ LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """What the user is to fill in, and what stands for it while other rows are read."""
 SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
 PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
+COVARIATES = {
+    "time": ("time", "time_s", "time_h", "timestamp", "seconds", "minutes", "hours", "hour"),
+    "temperature": ("temperature", "temp", "temperature_c", "temp_c"),
+}
+"""Option -> names of columns with which something may drift."""
 ROTATIONS = (
     ("qx", "qy", "qz", "qw"),
     ("quat_x", "quat_y", "quat_z", "quat_w"),

@@ -132,7 +132,7 @@ class Live:
             if isinstance(sent.entry, DiffeoCalibError):
                 raise sent.entry
             if "do" in entry:
-                self.decide(entry.get("row"), entry["do"])
+                self.decide(entry.get("line"), entry["do"])
             elif entry:
                 number = self.ids.get(str(entry.get(ID)))
                 told = self.answer(self._append(entry) if number is None else number) | told
@@ -143,11 +143,16 @@ class Live:
         self._say(told)
         sent.answer(told)
 
-    def decide(self, row: object, what: object) -> None:
-        """Do what a user decided about a row; InputError for no such row or decision."""
+    def decide(self, line: object, what: object) -> None:
+        """Do what a user decided about the rows of a line; InputError for no such line or decision."""
         if what not in DECISIONS:
             raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
-        getattr(self.campaign, str(what))(row)
+        rows = [row for row, owner in enumerate(self.owner) if owner + 2 == line]
+        if not rows:
+            expected = f"a line of {self.source.csv} with a row, 2 to {len(self.lines) + 1}"
+            raise InputError.of("`line`", expected=expected, got=str(line))
+        for row in rows:
+            getattr(self.campaign, str(what))(row)
         self.journal.add(self._revised())
 
     def _append(self, row: Entry) -> int:
@@ -201,10 +206,10 @@ class Live:
         if number in self.unreadable:
             return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
         rows = [row for row, owner in enumerate(self.owner) if owner == number]
-        found |= known[rows[0]].entry()
+        found = known[rows[0]].entry() | found
         found["text"] = "\n".join(str(known[row]) for row in rows)
         revised, self.late = dict.fromkeys([*self.late, *self.revised]), []
-        return found | {"revised": [{"row": row, "accepted": known[row].accepted} for row in revised]}
+        return found | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
 
     def _say(self, told: Entry) -> None:
         """Print an answer."""

@@ -24,6 +24,7 @@ from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 
 def load_kinematics(path: Path) -> CalibratedKinematics:
@@ -50,7 +51,7 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
     model = load_kinematics(path)
     if model.payload is not None and mass is None:
         what = f"{path} was calibrated with payloads"
-        raise InputError.of(what, expected="--payload", fix="name the mass that the robot carries, 0 without load")
+        raise InputError.of(what, expected="--payload-mass", fix="name the mass that the robot carries, 0 without load")
     return model if mass is None else model.with_payload(mass)
 
 
@@ -61,7 +62,7 @@ def planned(model: CalibratedKinematics, mass: float | None) -> tuple[Calibrated
     if mass is not None:
         model = model.with_payload(mass)
     elif model.payload is not None:
-        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
+        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload-mass for another one")
     return model, model.geometry.tool
 
 
@@ -102,9 +103,19 @@ def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
 
 
 def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """When the model was fitted and to what, if its file says so."""
+    """When the model was fitted and to what, if its file says so; what drifted then, and for when the model holds."""
     if model.provenance is not None:
         yield model.provenance.sentence(model.robot.name, len(model.configurations))
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield from drift.sentences()
+
+
+def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
+    """What becomes of a drift of the fit where new rows of another date are compared or joined with it."""
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield f"{drift.of_another_date}: these rows meet the model as it was at {drift.holds()}"
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:

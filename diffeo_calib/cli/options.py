@@ -105,12 +105,12 @@ Note = Annotated[
 ]
 Mass = Annotated[
     float | None,
-    typer.Option("--payload", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),
+    typer.Option("--payload-mass", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),
 ]
 Marker = Annotated[
     MarkerFreedom,
     typer.Option(
-        "--marker",
+        "--marker-freedom",
         help="Whether the markers are the same (0.05 mm), have moved a little (1 mm) or are other ones; by default the "
         "rows decide.",
     ),
@@ -390,7 +390,7 @@ class Correction:
     rate: float | None = option(
         "The rows are a path: the correction of a joint changes by at most so many degrees from row to row.", "DEG"
     )
-    payload: Mass = None
+    payload_mass: Mass = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -398,6 +398,7 @@ class Export:
     """The files to write, and how."""
 
     urdf: Path | None = option("Write the robot's own URDF with corrected joint origins.", "URDF")
+    mjcf: Path | None = option("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = option("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
     dh_convention: DH = option("Convention of --dh; craig is also called modified.", default=DH.standard)
     ur_kinematics: Path | None = option("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
@@ -405,7 +406,7 @@ class Export:
     joint_offsets: Path | None = option("Write the best joint offsets, all other geometry nominal.", "CSV")
     correction_tables: Path | None = option("Write transmission errors and their corrections by joint value.", "CSV")
     with_tables: bool = option(
-        "Fit --urdf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
+        "Fit --urdf, --mjcf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
     )
     c: Path | None = option("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
     torch: Path | None = option("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
@@ -416,9 +417,8 @@ class Export:
         "FOLDER",
     )
     tool: str | None = option(
-        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, "
-        "and a rotation vector if it is turned. By default the tip itself, or the tool that the model was saved "
-        "with.",
+        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and a "
+        "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
     tool_from: ToolFromOption = ToolFrom.tip
@@ -428,14 +428,14 @@ class Export:
     )
     tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
     robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
-    payload: Mass = None
+    payload_mass: Mass = None
     length: Length = option("Unit of lengths in the CSV files written.", default=Length.m)
     angle: Angle = option("Unit of angles in the CSV files written.", default=Angle.rad)
 
     @property
     def outputs(self) -> dict[str, Path | None]:
         """Option -> file to write, None where it is not wanted."""
-        rigid = {"--urdf": self.urdf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
+        rigid = {"--urdf": self.urdf, "--mjcf": self.mjcf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
         tables = {"--joint-offsets": self.joint_offsets, "--correction-tables": self.correction_tables}
         return rigid | tables | {"--c": self.c, "--torch": self.torch, "--onnx": self.onnx, "--camera": self.camera}
 
@@ -486,7 +486,7 @@ class Planned:
         "By default 0.1 m beside and 0.1 m in front of the tip.",
         "X,Y,Z",
     )
-    target: Path | None = option("Configurations at which the robot shall be accurate; by default everywhere.", "CSV")
+    target_poses: Path | None = option("Configurations where the robot shall be accurate; by default all.", "CSV")
     measured: Path | None = option("Configurations that are measured already but not in the model.", "CSV")
     free: Free | None = option("With MODEL: what has moved since its fit; base is the device's or the robot's.")
     sensor: list[str] | None = option(
@@ -497,4 +497,4 @@ class Planned:
         "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
         "KIND[=NUMBERS]",
     )
-    payload: Mass = None
+    payload_mass: Mass = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf
 from pathlib import Path
@@ -18,6 +18,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residua
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cli.guesses import (
+    COVARIATES,
     LENS,
     PAYLOADS,
     SESSIONS,
@@ -68,7 +69,7 @@ class RowColumns:
 
     Args:
         markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
-            or its set-up. payload: of the mass carried.
+            or its set-up. payload: of the mass carried. covariates: option, time or temperature -> column.
     """
 
     markers: list[list[str]]
@@ -76,6 +77,7 @@ class RowColumns:
     readings: list[str]
     session: str | None
     payload: str | None
+    covariates: dict[str, str] = field(default_factory=dict)
 
     @property
     def without_length(self) -> bool:
@@ -105,6 +107,8 @@ class RowColumns:
             yield "session", self.session, why
         if self.payload is not None:
             yield "payload", self.payload, "by its name: the known mass that the robot carried"
+        for option, column in self.covariates.items():
+            yield option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
 
     @property
     def lens_missing(self) -> bool:
@@ -122,11 +126,13 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
-        fix += 'column such as `distance`, `wire` or `height`; all options are in the README, "Without a tracker"'
+        fix += 'column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading'
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
     named = [name for name in sheet.header if name not in joints]
     session = None if sockets and not readings else guess_column(named, SESSIONS)
-    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS))
+    guessed = {option: guess_column(others, words) for option, words in COVARIATES.items()}
+    drifting = {option: column for option, column in guessed.items() if column is not None}
+    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting)
 
 
 def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:

@@ -135,7 +135,7 @@ def torch_alone() -> Iterator[None]:
     """Limit NumPy and SciPy to one thread inside; torch keeps its threads. For code that calls both in turn."""
     import scipy.linalg  # noqa: F401, PLC0415  # slow to import; its OpenBLAS is found only once it is loaded
 
-    with _openblas().limit(limits=1):
+    with _openblas("scipy").limit(limits=1):
         yield
 
 
@@ -145,17 +145,16 @@ def one_thread() -> Iterator[None]:
 
     Entering takes 0.1 ms.
     """
-    with _openblas_of_numpy().limit(limits=1):
+    with _openblas("numpy").limit(limits=1):
         yield
 
 
 @cache
-def _openblas_of_numpy() -> Any:
-    return _openblas()  # looking for libraries takes milliseconds: once
+def _openblas(loaded: str) -> Any:
+    """Controller of the OpenBLAS libraries that are there once a package is loaded, those of torch excepted.
 
-
-def _openblas() -> Any:
-    """Controller of the OpenBLAS libraries that are loaded, those of torch excepted."""
+    They are looked for once, since that takes milliseconds.
+    """
     from threadpoolctl import ThreadpoolController  # noqa: PLC0415
 
     found = ThreadpoolController()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         write_correction_tables,
         write_joint_offsets,
     )
+    from diffeo_calib.interop.mjcf import write_mjcf
     from diffeo_calib.interop.numpy_model import NumpyKinematics, load_numpy
     from diffeo_calib.interop.rigid import JointOffsets, RigidKinematics, best_joint_offsets, rigid_kinematics
     from diffeo_calib.interop.sklearn import DiffeoRegressor
@@ -45,6 +46,7 @@ __all__ = [
     "write_correction_tables",
     "write_dh",
     "write_joint_offsets",
+    "write_mjcf",
     "write_ur_kinematics",
     "write_urdf",
 ]
@@ -56,6 +58,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "c_source": "CFiles write_c",
             "dh": "DHTable dh_table write_dh",
             "joint_tables": "CorrectionTable correction_tables write_correction_tables write_joint_offsets",
+            "mjcf": "write_mjcf",
             "numpy_model": "NumpyKinematics load_numpy",
             "rigid": "JointOffsets RigidKinematics best_joint_offsets rigid_kinematics",
             "sklearn": "DiffeoRegressor",

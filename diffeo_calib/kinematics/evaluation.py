@@ -26,6 +26,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import MOUNTING, SESSION, MountedMarkers, Places
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -123,7 +124,9 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
         found = found.beside(sensor_of(table).place(table, beside))
+    drift = KnownDrift.of(kinematics)
     sentences = [f"{found.numbers} numbers in all were found from the rows that are judged"] * (found.numbers > 0)
+    sentences += [] if drift is None else drift.in_rows(data)
     return replace(found, found=(*found.found, *sentences))
 
 
@@ -152,7 +155,9 @@ def mounted_markers(model: CalibratedKinematics) -> MountedMarkers:
 
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
-    return [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
+    drift = KnownDrift.of(model)
+    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
+    return lines if drift is None else [*lines, *drift.sentences()]
 
 
 def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[Tensor], Tensor]:
@@ -161,8 +166,9 @@ def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[
 
 
 def _predicted(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
-    """(N, P, 3) markers of kinematics under the payloads of the rows, m."""
-    return at_payloads(kinematics, data)(data.q).detach()
+    """(N, P, 3) markers of kinematics under the payloads of the rows, and where a drift moved them, m."""
+    own, drift = at_payloads(kinematics, data), KnownDrift.of(kinematics)
+    return own(data.q).detach() if drift is None else drift.points(own, data)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -191,7 +197,8 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     if model.registration is not None:
         return 0
     measured = COORDINATES * (model.markers - model.ball)  # what the ball's share are places of its sockets
-    shared = model.map.noise.shared[:, :measured]
+    shared, drift = model.map.noise.shared[:, :measured], KnownDrift.of(model)
+    shared = shared if drift is None else shared[..., : -drift.sizes.numel()]  # which all rows share
     if not shared[:1].numel() or len(shared) != len(model.configurations):
         return 0
     elsewhere = model.configurations[(shared != 0).any(2).any(1)]

@@ -167,6 +167,12 @@ class RowGroups:
         return self.q.new_zeros(0) if payload is None else payload
 
     @property
+    def drifting(self) -> dict[str, Tensor]:
+        """The covariates (N,) by name."""
+        values: Any = getattr(self, "covariates", None)
+        return {} if values is None else dict(zip(getattr(self, "covariate_names", ()), values.T, strict=True))
+
+    @property
     def places(self) -> Tensor:
         """(N,) int64, number of the place of each row's socket, -1 for other rows."""
         return self.socket_numbers
@@ -369,11 +375,6 @@ class RowTable(RowGroups):
             MeasurementError: not one per row, or not finite.
         """
         return with_attributes(self, **covariates({"time": time, "temperature": temperature}, self.q))
-
-    @property
-    def drifting(self) -> dict[str, Tensor]:
-        """The covariates (N,) by name."""
-        return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
 
     def with_load(self, load: Payload) -> Self:
         """Return the same rows with the masses of a payload, if there is one."""

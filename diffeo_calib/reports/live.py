@@ -115,7 +115,7 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None, goa
     steps = [] if found is None else [(count + step, 1e3 * value) for step, value in enumerate(found.expected)]
     next_q = campaign.candidates[:0] if found is None else found.q[:1]
     verdicts = [
-        {"row": one.row, "text": str(one), "accepted": one.accepted, "fits": one.fits}
+        {"line": one.line, "text": str(one), "accepted": one.accepted, "fits": one.fits}
         for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
     ]
     frames = robot.joint_frames(next_q)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(1, 0, 3)
@@ -160,15 +160,15 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def do_POST(self) -> None:
-        """A decision about a row, such as /reject?row=N."""
+        """A decision about a row, such as /reject?line=N."""
         parts = urlsplit(self.path)
-        row = parse_qs(parts.query).get("row", [""])[0]
+        line = parse_qs(parts.query).get("line", [""])[0]
         if not self._allowed() or self.headers.get(HEADER) is None:
             self.send_error(403)
-        elif parts.path not in PATHS or not row.isdecimal():
+        elif parts.path not in PATHS or not line.isdecimal():
             self.send_error(404)
         else:
-            self.page.decisions.put(Sent({"do": parts.path[1:], "row": int(row)}, lambda _: None))
+            self.page.decisions.put(Sent({"do": parts.path[1:], "line": int(line)}, lambda _: None))
             self._begin("text/plain")
 
     def log_message(self, *_: object) -> None:

@@ -29,7 +29,7 @@ from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.joint import joint_motions, turned_axes, walk
-from diffeo_calib.robots.se3 import right_jacobian, rigid, rotation, twist_transform
+from diffeo_calib.robots.se3 import right_jacobian, rigid, twist_transform
 from diffeo_calib.robots.tree import Tree
 
 
@@ -148,7 +148,7 @@ class Geometry:
         frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.places[:, : L - 1]], dim=1)  # base first
         R = frames[..., :3, :3]
         w = values[..., : 6 * L].unflatten(-1, (L, 6))[..., 3:]  # (L, 3), or (N, L, 3)
-        by_shift = (R @ rotation(w).mT)[:, None].expand(N, P, L, 3, 3)
+        by_shift = (R @ at.twists[..., :3, :3].mT)[:, None].expand(N, P, L, 3, 3)
         arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, L, 3)
         # -[d]x a = a x d, for every column a of R' Jr; they run along dimension 3 here
         columns = (R @ right_jacobian(w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
@@ -189,7 +189,7 @@ class Geometry:
         places = walk(start, torch.cat([offsets, ends]), motions, chain.before[:count])
         tips, tool = places[:, self.tip_places.to(device)], self.tool.to(device) + shifts
         points = (tips[..., :3, :3] @ tool[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return _State(start, places, tips, points)
+        return _State(twists, start, places, tips, points)
 
     def _theta(self, theta: Tensor | None, like: Tensor) -> Tensor:
         if theta is None:
@@ -208,10 +208,12 @@ class _State:
     """One pass along the robot.
 
     Args:
-        start: (4, 4) the base. places: (N, n_all + tips, 4, 4) joints' frames after their error twists, and tips.
+        twists: (n_all + 1, 4, 4) errors, (N, n_all + 1, 4, 4) if they differ between rows. start: (4, 4) the base.
+        places: (N, n_all + tips, 4, 4) joints' frames after their error twists, and tips.
         tips: (N, P, 4, 4) those of the markers. points: (N, P, 3) the markers.
     """
 
+    twists: Tensor
     start: Tensor
     places: Tensor
     tips: Tensor

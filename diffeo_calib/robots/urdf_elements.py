@@ -82,7 +82,7 @@ class URDF:
         Raises:
             RobotError: not a URDF, or a joint whose description is broken.
         """
-        root, ignored = _parse(content, path)
+        root, ignored = xml_of(content, path)
         links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
         joints = [_read_joint(element, path) for element in root.findall("joint")]
         macros = any(element.prefix == "xacro" or str(element.tag).startswith("xacro:") for element in root)
@@ -118,7 +118,7 @@ def content_of(path: Path) -> bytes:
     return content
 
 
-def _parse(content: bytes, path: Path) -> tuple[Any, list[str]]:
+def xml_of(content: bytes, path: Path) -> tuple[Any, list[str]]:
     """Root element of the file, and which harmless faults it has.
 
     Undeclared name spaces, common in old files, are accepted. A default name space is dropped.

@@ -299,10 +299,10 @@ def smooth(x: Any, order: int, closed: Callable[[Any], Any], where: Callable[...
     Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
     """
     small = x < 1.0
-    near, far = where(small, x, 0.0), where(small, 1.0, x)
+    minus, far = where(small, -x, 0.0), where(small, 1.0, x)
     series = 0.0
-    for k in reversed(range(SERIES_TERMS)):  # Horner
-        series = 1.0 / factorial(2 * k + order) - near * series
+    for k in reversed(range(SERIES_TERMS)):  # Horner; torch subtracts a tensor from a number several times slower
+        series = minus * series + 1.0 / factorial(2 * k + order)
     return where(small, series, closed(far**0.5))
 
 

@@ -264,9 +264,10 @@ def placed(data: Readings, points: Tensor) -> Devices:
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None
 
 
-SESSION, SOCKET, MOUNTING = "session", "socket", "mounting"
-"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, and markers
-that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m."""
+SESSION, SOCKET, MOUNTING, DRIFT = "session", "socket", "mounting", "drift"
+"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, markers
+that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m, and columns with which
+something drifts, see `KnownDrift`."""
 MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
@@ -278,7 +279,7 @@ class PlacedDevices:
     """Devices of one kind in the frame of a model.
 
     Args:
-        kind: "session", "socket", or that of readings.
+        kind: "session", "socket", "mounting", "drift", or that of readings.
         names: D names. constants: (D, c). deviations: (D, k) standard deviations of their increments, m or rad.
         rows: (M,) int64, rows of the fit that they measured. device: (M,) int64, which of them did.
         shown: how their readings are shown; None for other kinds, and in files of old versions.
@@ -352,6 +353,8 @@ class PlacedDevices:
         devices = self.devices
         if devices is not None:
             return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        if self.kind == DRIFT:  # which names the robot's joints
+            return []
         if self.kind == MOUNTING:
             return mounted_sentences(
                 self.names, *(each.unflatten(1, (-1, 3)) for each in (self.constants, self.deviations))

@@ -14,7 +14,7 @@ import torch
 import two_arms_bank
 from kind_bank import Kind, kind_named
 from mixture_bank import DISTANCES
-from simulated_camera import FEWEST_SEEN, camera_arm, seen_corners
+from simulated_camera import FEWEST_SEEN, CameraArm, camera_arm, seen_corners
 from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
@@ -89,10 +89,16 @@ def _readings(kind: str, rows: int, seed: int) -> dc.Readings:
     return reading_bank.readings(SimulatedArm(0, markers=1), kind, rows, noise=2e-5, seed=seed)
 
 
+@cache
+def _seen_by_camera() -> CameraArm:
+    """More configurations than the first batches have."""
+    return camera_arm(200)
+
+
 def _camera(rows: int, seed: int, *, images: bool) -> dc.Measurements:
-    seen = camera_arm(rows, seed=1)
-    whole = camera_arm(60 + rows * (seed - 98), seed=1)
-    q, boards = whole.q[-rows:], whole.boards[-rows:]
+    seen, last = _seen_by_camera(), 60 + rows * (seed - 98)
+    q, boards = seen.q[last - rows : last], seen.boards[last - rows : last]
+    assert len(q) == rows
     names = seen.arm.nominal.joint_names
     if images:
         corners = seen_corners(boards, 0.1, seed)

@@ -154,6 +154,8 @@ SOURCES: dict[str, Callable[[], Source]] = {
 KINDS = tuple(SOURCES)
 POSITIONED = ("positions", "hidden markers")
 """Kinds whose tables are joint values and coordinates, and nothing else."""
+FREE = ("ball in sockets", "distances", "heights", "images")
+"""Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
 CAMERAS = ("camera on the tool", "images of a board")
 
@@ -211,13 +213,16 @@ class Kind:
         return self.result.model
 
     @cached_property
-    def other(self) -> dc.CalibratedKinematics:
-        """A second model, of other rows of the same robot."""
-        rows: Any = self.source.golden.rows
+    def part(self) -> Any:
+        """Rows of ``data``, those of `fit --holdout 0.2`."""
+        return self.data.split(0.8)[0]
+
+    @cached_property
+    def of_part(self) -> Any:
+        """The calibration of ``part``."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            part = rows.split(0.8, seed=1)[0]
-            return dc.calibrate(self.robot, part, hyperparameters=self.scales).model
+            return dc.calibrate(self.robot, self.part, hyperparameters=self.scales)
 
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""

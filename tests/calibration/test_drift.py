@@ -28,6 +28,7 @@ from diffeo_calib.measurements.csv.writing import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 ARM = SimulatedArm(seed=0)
 ROWS, OFFSET_RAD = 80, 4e-4
@@ -93,7 +94,7 @@ def test_readings_show_a_drift_too() -> None:
 
 
 def test_rows_are_brought_to_the_middle_of_the_column() -> None:
-    """Shift, turn, growth and offsets, written out: effects are their slopes, and `aligned` undoes them."""
+    """Shift, turn, growth and offsets, written out: effects are slopes, `points` has them, `aligned` undoes them."""
     q, time = ARM.sample(20, seed=3), hours(20)
     geometry = Geometry.nominal(ARM.nominal, 2)
     nominal = GeometryMap(geometry, elastic=True)
@@ -110,8 +111,40 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
     effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
-    back = replace(drift, centre=centre, size_by_column=size[None], deviations=size[None].abs()).aligned(data)
+    found = replace(drift, centre=centre, size_by_column=size[None], deviations=size[None].abs()).known
+    back = found.aligned(data)
     assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
+    assert back.covariates is None
+    assert_close(found.points(lambda q: nominal(q, zero).view(-1, 2, 3), data), moved, rtol=0, atol=1e-5)
+
+
+def test_a_model_keeps_its_drift(tmp_path: Path) -> None:
+    data = drifting_rows()
+    result, other = calibrated(data[:ROWS]), data[ROWS:]
+    dc.save(result.model, tmp_path / "m.safetensors")
+    model = dc.load(tmp_path / "m.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    known, told, untold = KnownDrift.of(model), dc.evaluate(model, other), dc.evaluate(model, other.with_covariates())
+    assert known is not None
+    assert told.rms == pytest.approx(dc.evaluate(result.model, other).rms, rel=1e-9)
+    assert told.rms < 0.7 * untold.rms
+    assert "time 5" in " ".join(untold.placed)  # from 3 to 7
+    assert list(known.sentences()) == drifts(result)[0].sentences()
+    with torch.inference_mode():
+        again = model.registered(other)
+    assert KnownDrift.of(again) is None
+    assert KnownDrift.of(ARM) is None
+
+
+def test_beyond_its_rows_a_drift_stays_as_at_the_end() -> None:
+    data = drifting_rows()
+    model = calibrated(data[:ROWS]).model
+    known: Any = KnownDrift.of(model)
+    late, last = (data[ROWS:].with_covariates(time=torch.full((60,), t, dtype=torch.float64)) for t in (900.0, 7.0))
+    assert_close(known.points(model, late), known.points(model, last), rtol=0, atol=1e-6)
+    (line,) = [line for line in known.in_rows(late) if "outside" in line]
+    assert re.search(r"\b60\b", line)
+    assert dc.evaluate(model, late).placed[-1] == line
 
 
 def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
@@ -153,6 +186,15 @@ def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
     done = command("fit", tmp_path / "t.csv", *robot, *columns, "-o", tmp_path / "m.safetensors")
     assert done.code == 0
     assert "drift with time" in done.out
+    for name, *more in (
+        ("evaluate", tmp_path / "t.csv", "--residuals", tmp_path / "r.csv"),
+        ("report", "-o", tmp_path / "r.html", "--data", tmp_path / "t.csv"),
+        ("export", "--c", tmp_path / "m.c"),
+        ("compare", tmp_path / "t.csv"),
+    ):
+        said = command(name, tmp_path / "m.safetensors", *more)
+        assert "another set-up" not in said.err
+        assert re.search(r"drift with time from 3\S* to [67]\S* .* holds for [45]\.", said.out.replace("\n", " ")), said
 
 
 @pytest.mark.parametrize(("left", "better"), [([0.9] * 100, True), ([1.0] * 99 + [0.0], False), ([0.99] * 100, False)])

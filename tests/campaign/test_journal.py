@@ -127,7 +127,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     done = command(*words, "--accepted", tmp_path / "accepted.csv")
     assert done.code == 0
     assert "going on after 14 lines" in done.out
-    assert "row 13 " not in done.out
+    assert "row 15 " not in done.out
     assert "mm as m" in done.out
     assert "line 23 left out" in done.out
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
@@ -146,7 +146,7 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     for how in ("--once", "--stdin"):
         done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
         assert done.code == 0
-        assert "row 17 looks wrong" in done.out
+        assert "row 19 looks wrong" in done.out
         assert "mm expected" in done.out
         assert "run.csv', line 22" in done.out
         accepted.append((tmp_path / "accepted.csv").read_text())
@@ -193,9 +193,9 @@ def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, l
     )
     assert process.stdout is not None
     address = urlsplit(process.stdout.readline().split()[-1])
-    assert any("row 15" in line for line in process.stdout)
+    assert any("row 17" in line for line in process.stdout)
     connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
-    connection.request("POST", "/reject?row=5", headers={"X-Campaign": "1"})
+    connection.request("POST", "/reject?line=7", headers={"X-Campaign": "1"})
     assert connection.getresponse().status == 200
     connection.close()
     journal = tmp_path / "run.csv.journal"

@@ -187,6 +187,16 @@ def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.C
     assert_close(found.q, q[1:2])
 
 
+def test_rows_are_named_by_their_lines_which_go_on() -> None:
+    campaign, (q, y) = dc.Campaign(ARM.nominal), ARM.measure(3, seed=1)
+    rows = dc.Measurements(q, y, doubt=False)
+    for table in (rows.with_line_numbers([2, 3, 7]), rows, rows.with_line_numbers([20, 21, 22])):
+        campaign.add(table)
+    assert [one.line for one in campaign.verdicts] == [2, 3, 7, 8, 9, 10, 20, 21, 22]
+    assert [one.row for one in campaign.verdicts] == list(range(9))
+    assert str(campaign.verdicts[2]).startswith("row 7: ")
+
+
 def test_a_thread_makes_the_same_models(measured: tuple[Tensor, Tensor]) -> None:
     campaign = dc.Campaign(ARM.nominal, background=True)
     for q, y in zip(*(part[:20] for part in measured), strict=True):

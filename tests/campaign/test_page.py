@@ -43,7 +43,7 @@ def answer(page: Page, method: str, path: str, **headers: str) -> int:
 def decided(page: Page) -> list[tuple[str, int]]:
     """What two buttons decided."""
     both = page.decisions.get(timeout=5), page.decisions.get(timeout=5)
-    return [(one.entry["do"], one.entry["row"]) for one in both if one is not None and isinstance(one.entry, dict)]
+    return [(one.entry["do"], one.entry["line"]) for one in both if one is not None and isinstance(one.entry, dict)]
 
 
 @pytest.fixture
@@ -58,12 +58,12 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
     assert answer(page, "GET", "/", Host="evil.example:80") == 403
     assert answer(page, "GET", "/../journal") == 404
     mine = {"X-Campaign": "1"}
-    assert answer(page, "POST", "/reject?row=3") == 403
-    assert answer(page, "POST", "/reject?row=3", Host="evil.example", **mine) == 403
-    assert answer(page, "POST", "/reject?row=x", **mine) == 404
+    assert answer(page, "POST", "/reject?line=3") == 403
+    assert answer(page, "POST", "/reject?line=3", Host="evil.example", **mine) == 403
+    assert answer(page, "POST", "/reject?line=x", **mine) == 404
     assert page.decisions.empty()
-    assert answer(page, "POST", "/reject?row=3", **mine) == 200
-    assert answer(page, "POST", "/accept?row=4", **mine) == 200
+    assert answer(page, "POST", "/reject?line=3", **mine) == 200
+    assert answer(page, "POST", "/accept?line=4", **mine) == 200
     assert decided(page) == [("reject", 3), ("accept", 4)]
 
 
@@ -105,7 +105,7 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
         json.dumps(state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4), allow_nan=False)
     )
     assert state["state"] == "15 of 16 rows accepted; 0.5 mm expected"
-    assert [one["row"] for one in state["verdicts"]] == list(range(15, 7, -1))
+    assert [one["line"] for one in state["verdicts"]] == list(range(15, 7, -1))
     assert len(state["done"]) == 16
     assert len(state["links"]) == 7
     empty = dc.Campaign(ARM.nominal)

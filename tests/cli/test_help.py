@@ -104,17 +104,27 @@ OPTIONS = {
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
-        *("--tip", "--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload"),
+        *("--tip", "--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload-mass"),
     ],
     "export": [
-        *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
+        *("MODEL", "--urdf", "--mjcf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--camera", "--tool", "--tool-from", "--frame", "--payload", "--tip"),
+        *("--c", "--torch", "--onnx", "--camera", "--tool", "--tool-from", "--frame", "--payload-mass", "--tip"),
     ],
     "plan": [
         *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),
-        *("--candidates", "--target", "--measured", "--draw", "--range", "--tracker", "--facing", "--cone", "--floor"),
-        *("--column", "--collisions", "--sensor", "--payload", *TABLE[1:]),
+        *(
+            "--candidates",
+            "--target-poses",
+            "--measured",
+            "--draw",
+            "--range",
+            "--tracker",
+            "--facing",
+            "--cone",
+            "--floor",
+        ),
+        *("--column", "--collisions", "--sensor", "--payload-mass", *TABLE[1:]),
     ],
     "recalibrate": [
         *(
@@ -130,7 +140,7 @@ OPTIONS = {
             *DRIFT,
             "-o",
             "--output",
-            "--marker",
+            "--marker-freedom",
             "--drift",
             "--seed",
             "--note",
@@ -138,7 +148,7 @@ OPTIONS = {
     ],
     "compare": [
         *("OLD", "OTHER", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--remounted", "--payload", *DRIFT),
-        *("--marker", "--level", "--seed", "--figure"),
+        *("--marker-freedom", "--level", "--seed", "--figure"),
     ],
     "report": [
         *(

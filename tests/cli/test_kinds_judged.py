@@ -5,22 +5,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import jsonschema
 import pytest
 import torch
 from command_bank import Command
-from kind_bank import KINDS, UNITS, Kind, kind_named
+from kind_bank import FREE, KINDS, UNITS, Kind, kind_named
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 
-SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text())
 NUMBERS = {"sessions": 2 * 6}
 """How many are found from the rows that are judged: a model knows the places of the devices of its fit."""
-FREE = ("ball in sockets", "distances", "heights", "images")
-"""Kinds without a measured position."""
 
 
 @pytest.fixture(params=KINDS, scope="module")
@@ -67,33 +62,6 @@ def test_residuals_are_measured_minus_predicted(kind: Kind) -> None:
     assert [entry["row"] for entry in lines] == sorted(entry["row"] for entry in lines)
 
 
-def test_evaluate_command(kind: Kind, command: Command, tmp_path: Path) -> None:
-    """The same keys for every kind; the numbers are those of Python; residuals for every row; a limit."""
-    data, page, (csv_file, given) = kind.data, tmp_path / "e.json", kind.table()
-    table = tmp_path / "r.csv"
-    options = ["--residuals", table, "--json", page, "--fail-above", "1m"]
-    done = command("evaluate", kind.file, csv_file, *given, *options)
-    assert done.code == 0, done.err
-    written = json.loads(page.read_text())
-    jsonschema.validate(written, SCHEMA)
-    results = written["results"]
-    found = dc.evaluate(kind.model, data)
-    kinds = found if isinstance(found, Evaluations) else {found.kind: found}
-    assert set(results["kinds"]) == set(kinds)
-    for name, one in kinds.items():
-        entry = results["kinds"][name]["all"]
-        assert (entry["what"], entry["unit"]) == (one.what, one.shown[0])
-        assert entry["rms"] == pytest.approx(
-            one.shown[1] * one.rms, rel=0.02 if kind.name == "images of a board" else 1e-3
-        )
-    header, *lines = table.read_text().splitlines()
-    assert header == "line,used_in_fit,kind,device,marker,dx,dy,dz,size,unit"
-    assert len({line.split(",")[0] for line in lines}) > 0
-    assert results["accepted"]
-    expected = "expected over the joint ranges" if kind.name in FREE else "on "
-    assert expected in " ".join(done.out.split())
-
-
 def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path) -> None:
     """Every kind has its page; errors of each kind by stage, in its unit."""
     path = tmp_path / "page.html"
@@ -106,15 +74,6 @@ def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path) -> None:
         assert "compare measured positions" in text
     if kind.name == "images":
         assert "RMS [px]" in text
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_report_command(kind: Kind, command: Command, tmp_path: Path) -> None:
-    page = tmp_path / "r.json"
-    csv_file, given = kind.table()
-    done = command("report", kind.file, "-o", tmp_path / "p.html", "--data", csv_file, *given, "--json", page)
-    assert done.code == 0, done.err
-    jsonschema.validate(json.loads(page.read_text()), SCHEMA)
 
 
 @pytest.mark.parametrize("name", ["hidden markers", "mixture"])

@@ -56,11 +56,26 @@ def test_next_poses_and_poses_to_measure_again(
     assert "guesses" not in done.out
     done = command(
         *("plan", file, "-n", 6, "-o", again, *UNITS, "--candidates", site.csv),
-        *("--free", "base", "--measured", first, "--target", first),
+        *("--free", "base", "--measured", first, "--target-poses", first),
     )
     assert done.code == 0, done.err
     expected = dc.plan(model, site.data.q, 6, free="base", measured=q, target=q)
     torch.testing.assert_close(planned(again, model.robot)[0], expected.q, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["plan", "--target=p.csv", "-n", 3, "-o", "o.csv"], "--target-poses"),
+        (["correct", "m", "p.csv", "--payload", 5, "-o", "o.csv"], "--payload-mass"),
+        (["recalibrate", "m", "p.csv", "--marker", "same", "-o", "o"], "--marker-freedom"),
+    ],
+)
+def test_former_names_of_options_are_taken_with_a_warning(words: list[object], name: str, command: Command) -> None:
+    done = command(*words)
+    assert done.code == 1  # there are no such files
+    assert "warning" in done.err
+    assert name in done.err
 
 
 @pytest.mark.parametrize(

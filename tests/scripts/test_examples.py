@@ -30,6 +30,6 @@ def test_examples_run(
     assert printed.err == ""
 
 
-def test_every_example_is_linked_from_the_readme() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert [path.name for path in EXAMPLES if f"scripts/examples/{path.name}" not in text] == []
+def test_every_example_is_linked_from_the_documentation() -> None:
+    text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "scripts/docs/pages").rglob("*.md"))
+    assert [path.name for path in EXAMPLES if f"examples/{path.name})" not in text] == []

@@ -8,7 +8,6 @@ predict rows that are left out better, see :func:`worth_it`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,15 +17,15 @@ from torch import Tensor
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.sensors.known_drift import KnownDrift
+from diffeo_calib.sensors.places import PlacedDevices
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""
 WORTH = 0.97
 """Part of the RMS leave-one-out error that may remain at most with the drift in the model."""
 SURE = 3.0
-"""Standard deviations from which a gain in squared errors is no chance, and from which an unknown is reported."""
+"""Standard deviations from which a gain in squared errors is no chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,44 +96,21 @@ class Drift(DeviceSet):
         values = values if other.data.covariate_names == self.names else middle
         return replace(self, values=values, q=q, centre=other.centre)
 
-    def aligned(self, data: Any) -> Any:
-        """Rows as they would be measured in the middle of the columns; those that do not tell the columns stay."""
-        if self.size_by_column is None or self.centre is None or data.covariate_names != self.names:
-            return data
-        moved = self.ramp(data.covariates) @ self.size_by_column  # (N, 7 + n)
-        T = torch.eye(4, dtype=moved.dtype, device=moved.device).repeat(len(moved), 1, 1)
-        R, away = torch.linalg.matrix_exp(-skew(moved[:, 3:6])), data.points.nanmean(1) - self.centre
-        T[:, :3, :3] = R
-        T[:, :3, 3] = self.centre - (R @ (self.centre + moved[:, :3])[..., None])[..., 0] - moved[:, 6:7] * away
-        return with_attributes(data.in_frames(T), q=data.q + moved[:, 7:])
+    @property
+    def known(self) -> KnownDrift | None:
+        """What a fit found; None before."""
+        if self.size_by_column is None or self.deviations is None or self.centre is None:
+            return None
+        ends = self.lowest, self.highest
+        return KnownDrift(self.names, self.joints, *ends, self.centre, self.size_by_column, self.deviations)
 
-    def placed(self) -> None:
-        """Nothing: the model holds for the middle of the columns."""
+    def placed(self) -> PlacedDevices | None:
+        """The drift, for rows that tell the columns."""
+        return None if self.known is None else self.known.placed()
 
     def sentences(self) -> list[str]:
         """How much drifted with each column, of what is known well."""
-        lines = []
-        for number, name in enumerate(self.names):
-            low, high = float(self.lowest[number]), float(self.highest[number])
-            what = ", ".join(self._known(number)) or "no single cause stands out"
-            lines.append(
-                f"drift with {name} from {low:g} to {high:g}: {what}; the model holds for {0.5 * (low + high):g}"
-            )
-        return lines
-
-    def _known(self, column: int) -> Iterator[str]:
-        """The unknowns that differ from zero."""
-        if self.size_by_column is None or self.deviations is None:
-            return
-        u, sd = self.size_by_column[column], self.deviations[column]
-        for part, what, unit in ((slice(0, 3), "shift", "mm"), (slice(3, 6), "turn", "mrad")):
-            if float((u[part] / sd[part]).abs().max()) > SURE:
-                yield f"the measuring frame by a {what} of {1e3 * float(u[part].norm()):.2g} {unit}"
-        if float(u[6].abs()) > SURE * float(sd[6]):
-            yield f"lengths by {1e6 * float(u[6]):+.2g} ppm"
-        for (name, turns), own, deviation in zip(self.joints, u[7:].tolist(), sd[7:].tolist(), strict=True):
-            if abs(own) > SURE * deviation:
-                yield f"the offset of {name} by {1e3 * own:+.2g} +- {1e3 * deviation:.1g} {'mrad' if turns else 'mm'}"
+        return [] if self.known is None else list(self.known.sentences())
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`: unknowns in m and rad over the range of every column."""

@@ -9,7 +9,7 @@ from typing import Any
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
 from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry
 from diffeo_calib.cli.console import plain, say
-from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import TableOptions
@@ -31,6 +31,8 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
     model = load_kinematics(old)
     source = table_of(model, table)
     for line in provenance_lines(model):
+        say(line)
+    for line in another_date_lines(model):
         say(line)
     found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)
     if not isinstance(found, Comparison):

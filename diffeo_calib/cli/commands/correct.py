@@ -69,7 +69,7 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
         InputError: options that contradict each other, columns that are missing or taken.
     """
     _check(options)
-    kinematics = load_laden(model, options.payload)
+    kinematics = load_laden(model, options.payload_mass)
     source = ProgramTable.of(program, as_fitted(kinematics, None, units)[1], options)
     table = source.written()
     if len(options.tip or ()) == 1:

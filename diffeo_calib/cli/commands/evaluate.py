@@ -12,7 +12,13 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of, refuse_impossible
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.models import (
+    another_date_lines,
+    check_payload_column,
+    load_kinematics,
+    provenance_lines,
+    table_of,
+)
 from diffeo_calib.cli.options import EvaluateOptions
 from diffeo_calib.cli.printed import (
     ErrorTable,
@@ -158,6 +164,8 @@ def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evalua
 def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     warn_outside_range(model, data.q)
+    for line in another_date_lines(model):
+        say(line)
     found = model.registered(data, free=free)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off

@@ -22,6 +22,7 @@ from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import in_unit, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
+from diffeo_calib.interop.mjcf import mjcf_text
 from diffeo_calib.interop.rigid import (
     RigidKinematics,
     applied_with_tables,
@@ -35,6 +36,7 @@ from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 PROGRAMS = ("--c", "--torch", "--onnx")
 MEGABYTE = 1e6
@@ -95,7 +97,7 @@ class Programs:
                 yield f"{option[2:]}: {target} ({target.stat().st_size / MEGABYTE:.1f} MB): {what}"
 
 
-RIGID = ("--urdf", "--dh", "--ur-kinematics")
+RIGID = ("--urdf", "--mjcf", "--dh", "--ur-kinematics")
 NOMINAL = "nominal robot, registered"
 
 
@@ -117,7 +119,7 @@ class _Export:
 
     def rigid(self, options: list[str], *, with_tables: bool, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
-        urdf = None if options == ["--dh"] else urdf_of(self.model.robot, self.given.robot)
+        urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else None
         found = rigid_kinematics(self.model, transmission=with_tables)
         self.geometry = found.geometry
         together = " and --correction-tables"
@@ -145,6 +147,8 @@ class _Export:
             self.lines += _dh_lines(table, self.given)
             return dh_text(table, self.length, self.angle)
         content = urdf or b""
+        if option == "--mjcf":
+            return mjcf_text(geometry)
         if option == "--urdf":
             return corrected_urdf(geometry, content).decode("utf-8", "surrogateescape")
         if self.given.ur_hash is None:
@@ -188,7 +192,7 @@ def run(path: Path, given: Export) -> None:
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
-    model = load_laden(path, given.payload)
+    model = load_laden(path, given.payload_mass)
     units = TableFormat(given.length.value, given.angle.value)
     own = tool_in_tip(model, given.tool, given.tool_from.value, units)
     tool = Tool(None if given.tool is None else own, None if given.frame is None else given.frame.value)
@@ -206,7 +210,7 @@ def run(path: Path, given: Export) -> None:
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
-    for line in (*export.lines, *_open_lines(export.model, rigid)):
+    for line in (*export.lines, *_open_lines(export.model, rigid), *_drift_lines(model)):
         say(line)
     for option in export.files:
         say(f"{option[2:]}: {wanted[option]}")
@@ -221,6 +225,14 @@ def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[s
             f"the rows of the fit leave {' and '.join(places)} open: base and tool of these files may both stand apart "
             "from the model's along it; use them together, at poses like those of the fit"
         )
+
+
+def _drift_lines(model: CalibratedKinematics) -> Iterator[str]:
+    """What files that know no time or temperature hold of a drift."""
+    drift = KnownDrift.of(model)
+    if drift is not None:
+        yield from drift.sentences()
+        yield f"no file knows the {' or the '.join(drift.names)}: they hold at {drift.holds()}"
 
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:

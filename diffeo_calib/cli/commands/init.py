@@ -21,7 +21,7 @@ from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading")
+COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
 """Entries that name columns."""
 
 

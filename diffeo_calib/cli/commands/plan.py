@@ -63,7 +63,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
         model = None if path is None else load_kinematics(path)
         stated = stated_units(units) if model is None else as_fitted(model, None, units)[1]
         table = table_format(stated)
-        source, markers = _robot(given, table) if model is None else planned(model, given.payload)
+        source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(stated.joints, robot)
 
@@ -82,7 +82,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
             source,
             q,
             count,
-            target=configurations(given.target),
+            target=configurations(given.target_poses),
             marker=None if framed else markers,
             measured=configurations(given.measured),
             free=None if given.free is None else given.free.value,

@@ -11,7 +11,7 @@ from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, progress_bar, say
-from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, table_of
+from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import TableOptions
@@ -35,6 +35,8 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     model = load_kinematics(old)
     source = table_of(model, table)
     for line in provenance_lines(model):
+        say(line)
+    for line in another_date_lines(model):
         say(line)
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)

@@ -41,7 +41,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
-from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.places import DRIFT, PlacedDevices
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -162,11 +162,14 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
     """The devices of a model beside another one of the same robot, as it stands among them.
 
+    A drift is none of them: it belongs to the rows of the old fit.
+
     Args:
         old, new: the models, of the same points. T: (4, 4) from the frame of the old one to that of the new one, m.
     """
     points = old(old.configurations).detach(), new(old.configurations).detach()
-    return tuple(own.carried(T.to(HOST), *(each.to(HOST) for each in points)) for own in old.placement)
+    kept = [own for own in old.placement if own.kind != DRIFT]
+    return tuple(own.carried(T.to(HOST), *(each.to(HOST) for each in points)) for own in kept)
 
 
 def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:

@@ -35,6 +35,7 @@ from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, errors_by_stage, expected_errors, stages_of
 from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.known_drift import KnownDrift
 
 LOG = logging.getLogger(__name__)
 CALM = 1.0
@@ -134,7 +135,7 @@ def find(
     check_arguments(model, data)
     if data is not None:
         _check_markers(model, data)
-        data = place(model, data).aligned(data)
+        data = _undrifted(model, place(model, data).aligned(data))
     progress("analysis", 0, STEPS)
     rows = FitRows(model, data)
     predictions = _predictions(rows, model, data)
@@ -163,6 +164,15 @@ def find(
     )
     progress("analysis", STEPS, STEPS)
     return found
+
+
+def _undrifted(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
+    """Rows that took no part in the fit as without a drift that the model knows; None if there are no others."""
+    drift = KnownDrift.of(model)
+    if drift is None:
+        return data
+    new = data.rows(~rows_used_in_fit(model, data.q))
+    return drift.aligned(new) if len(new) else None
 
 
 def check_arguments(model: object, data: object) -> None:

@@ -1,0 +1,150 @@
+"""A calibrated robot as MJCF, the format of MuJoCo: bodies, joints, inertias, and a site at every tip.
+
+The rigid kinematics are those of the corrected URDF (:mod:`~diffeo_calib.interop.urdf`),
+
+    T(q) = prod_l [ O_l E_l J_l(q_l) ] O_tip,
+
+with a body for every link, whose frame is at ``O_l E_l`` in the body before it. Masses and inertias are those of the
+URDF. Meshes, actuators and contacts are not written: take these bodies' places over into a model that has them.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from lxml import etree
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.files import write_whole
+from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.se3 import roll_pitch_yaw
+from diffeo_calib.robots.tree import BASE, Tree
+from diffeo_calib.robots.urdf_elements import xml_of
+
+SMALLEST_MASS_KG, SMALLEST_INERTIA = 1e-3, 1e-9
+"""Of bodies without <inertial>: MuJoCo refuses moving bodies without mass."""
+
+
+def write_mjcf(kinematics: CalibratedKinematics | Geometry, path: str | PathLike[str]) -> None:
+    """Write the best rigid kinematics for MuJoCo.
+
+    Args:
+        kinematics: a calibrated model, of which the best rigid kinematics are taken (:func:`rigid_kinematics`), or
+            these kinematics themselves.
+        path: the file to write.
+
+    Raises:
+        InputError: a base that is not above all other links, a mimic joint that several joints drive, or the file
+            cannot be written.
+    """
+    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+    write_whole(path, mjcf_text(geometry).encode())
+
+
+def mjcf_text(geometry: Geometry) -> str:
+    """The content of the file; errors as of :func:`write_mjcf`."""
+    chain = geometry.chain
+    if chain.ground_place is not None:
+        what = f"robot '{chain.name}' was calibrated from '{chain.base}', which is not above its other links"
+        raise InputError.of(what, fix="choose a base above all tips and loads, then MJCF can be written")
+    root = etree.Element("mujoco", model=chain.name)
+    limits = {"boundmass": repr(SMALLEST_MASS_KG), "boundinertia": repr(SMALLEST_INERTIA)}
+    etree.SubElement(root, "compiler", angle="radian", autolimits="true", **limits)
+    world = etree.SubElement(root, "worldbody")
+    bodies: dict[int, Any] = {BASE: etree.SubElement(world, "body", name=chain.base)}
+    origins, links = _origins(geometry), _Links(chain)
+    for number, (joint, parent) in enumerate(zip(chain.joints, chain.parents, strict=True)):
+        placed = _placed(origins[number])
+        bodies[number] = body = etree.SubElement(bodies[parent], "body", name=links.name(joint.name), **placed)
+        if (inertial := links.inertial(joint.name)) is not None:
+            etree.SubElement(body, "inertial", **inertial)
+        if joint.kind != "fixed":
+            etree.SubElement(body, "joint", name=joint.name, **_motion(joint))
+    for tip in chain.tips:
+        etree.SubElement(bodies[chain.ends[tip]], "site", name=tip)
+    mimics = [joint for joint in chain.joints if joint.mimic is not None]
+    if mimics:
+        together = etree.SubElement(root, "equality")
+        for joint in mimics:
+            etree.SubElement(together, "joint", **_following(joint))
+    return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _origins(geometry: Geometry) -> list[Tensor]:
+    """Where every joint's frame is in that of the joint before it, (4, 4) each, m."""
+    errors = iter(geometry.joint_errors)
+    return [j.origin if j.kind == "fixed" else j.origin @ next(errors) for j in geometry.chain.joints]
+
+
+def _placed(transform: Tensor) -> dict[str, str]:
+    quaternion = rotation_numbers(transform[None, :3, :3], "quat_wxyz", angle="rad")[0]
+    return {"pos": _text(transform[:3, 3]), "quat": _text(quaternion)}
+
+
+def _motion(joint: Joint) -> dict[str, str]:
+    """A joint's kind, axis and, where it has both, limits."""
+    found = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": _text(joint.axis)}
+    if isfinite(joint.lower) and isfinite(joint.upper) and joint.kind != "continuous" and joint.lower < joint.upper:
+        found["range"] = f"{joint.lower!r} {joint.upper!r}"
+    return found
+
+
+def _following(joint: Joint) -> dict[str, str]:
+    """A mimic joint as a polynomial of the joint that drives it."""
+    drivers = list((joint.mimic or {}).items())
+    if len(drivers) != 1:
+        fix = "write a URDF, or the whole model as a program"
+        raise InputError.of(f"mimic joint '{joint.name}'", expected="one joint that drives it", got=drivers, fix=fix)
+    (driver, factor), *_ = drivers
+    return {"joint1": joint.name, "joint2": driver, "polycoef": f"{joint.mimic_offset!r} {factor!r} 0 0 0"}
+
+
+class _Links:
+    """What the URDF of a robot says about the link below each joint; nothing without a URDF."""
+
+    def __init__(self, chain: Tree) -> None:
+        self._names: dict[str, str] = {}
+        self._inertials: dict[str, Any] = {}
+        if chain.source is not None:
+            root = xml_of(chain.source.encode("utf-8", "surrogateescape"), Path("the URDF"))[0]
+            children = ((joint.get("name"), joint.find("child")) for joint in root.findall("joint"))
+            self._names = {name: child.get("link") for name, child in children if child is not None}
+            self._inertials = {link.get("name"): link.find("inertial") for link in root.findall("link")}
+
+    def name(self, joint: str) -> str:
+        """Of the link, or of the joint where the link is not known."""
+        return self._names.get(joint, joint)
+
+    def inertial(self, joint: str) -> dict[str, str] | None:
+        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF says nothing."""
+        element = self._inertials.get(self.name(joint))
+        mass, inertia = (None if element is None else element.find(tag) for tag in ("mass", "inertia"))
+        if mass is None or inertia is None:
+            return None
+        xyz, R = _place(element.find("origin"))
+        ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in MOMENTS)
+        turned = R @ R.new_tensor([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.mT
+        moments = turned[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        return {"mass": mass.get("value"), "pos": xyz, "fullinertia": _text(moments)}
+
+
+MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+
+def _place(origin: Any) -> tuple[str, Tensor]:
+    """The xyz of an <origin> as text, and its rotation (3, 3)."""
+    xyz, rpy = ("0 0 0" if origin is None else origin.get(name, "0 0 0") for name in ("xyz", "rpy"))
+    return xyz, roll_pitch_yaw(*map(float, rpy.split()))
+
+
+def _text(numbers: Tensor) -> str:
+    """Numbers that are read back to the last bit."""
+    return " ".join(repr(value + 0.0) for value in numbers.tolist())

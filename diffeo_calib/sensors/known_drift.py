@@ -1,0 +1,148 @@
+"""Slow drift with a column of a table, such as time or temperature, that a model found at its fit and keeps.
+
+Between the lowest and the highest value of a column in the rows of the fit the measuring frame shifts and turns,
+lengths grow, and every joint offset changes; the model itself holds for the middle. Beyond these values nothing is
+known: the drift stays as it is at the nearer end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots.se3 import skew
+from diffeo_calib.sensors.places import DRIFT, PlacedDevices
+
+FRAME, GROWTH, OFFSETS = 6, 6, 7
+"""Of the unknowns: shift and turn of the frame come first, then growth, then the joint offsets."""
+ENDS_AND_CENTRE = 5
+SURE = 3.0
+"""Standard deviations from which an unknown is reported."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDrift:
+    """Drift with K columns of a robot with n joints.
+
+    Args:
+        names: of the columns. joints: names, and whether each turns.
+        lowest, highest: (K,) range of every column in the rows of the fit.
+        centre: (3,) about which the frame turns and lengths grow, m.
+        sizes, deviations: (K, 7 + n) over the whole range: shift [m], turn [rad], growth, joint offsets [rad or m].
+    """
+
+    names: tuple[str, ...]
+    joints: tuple[tuple[str, bool], ...]
+    lowest: Tensor
+    highest: Tensor
+    centre: Tensor
+    sizes: Tensor
+    deviations: Tensor
+
+    @classmethod
+    def of(cls, model: Any) -> KnownDrift | None:
+        """That of a model; None without one, and for other kinematics.
+
+        Raises:
+            InputError: numbers that do not fit the robot's joints.
+        """
+        own = next((own for own in getattr(model, "placement", None) or () if own.kind == DRIFT), None)
+        if own is None:
+            return None
+        joints = tuple(zip(model.robot.joint_names, model.robot.periodic, strict=True))
+        size = OFFSETS + len(joints)
+        if own.constants.shape[1] != ENDS_AND_CENTRE + size or own.deviations.shape[1] != size:
+            got = f"{own.constants.shape[1]} and {own.deviations.shape[1]}"
+            raise InputError.of(
+                "the drift of a model", expected=f"{ENDS_AND_CENTRE + size} and {size} numbers", got=got
+            )
+        lowest, highest = own.constants[:, :2].T
+        return cls(own.names, joints, lowest, highest, own.constants[0, 2:5], own.constants[:, 5:], own.deviations)
+
+    def placed(self) -> PlacedDevices:
+        """What a model keeps."""
+        centre = self.centre.expand(len(self.names), 3)
+        constants = torch.cat([self.lowest[:, None], self.highest[:, None], centre, self.sizes], 1)
+        return PlacedDevices.outside(DRIFT, self.names, constants.to(HOST), self.deviations.to(HOST))
+
+    def ramp(self, data: Any) -> Tensor:
+        """From -1/2 at the lowest value of each column to 1/2 at the highest: (N, K); 0 where rows do not tell it."""
+        ends = zip(self.names, self.lowest, self.highest, strict=True)
+        middle = data.q.new_full((len(data),), 0.5)
+        shares = [(data.drifting[k] - low) / (high - low) if k in data.drifting else middle for k, low, high in ends]
+        return torch.stack(shares, 1).clamp(0.0, 1.0) - 0.5
+
+    def points(self, kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
+        """Points (N, P, 3) of a model at rows, as the drift moved them, m."""
+        moved = self.ramp(data) @ self.sizes.to(data.q)
+        return self._drifted(kinematics(data.q + moved[:, OFFSETS:]).detach(), moved)
+
+    def aligned(self, data: Any) -> Any:
+        """Measured positions as they would be in the middle of the columns, which they then do not tell any more."""
+        moved = self.ramp(data) @ self.sizes.to(data.q)
+        centre = self.centre.to(moved)
+        T = torch.eye(4, dtype=moved.dtype, device=moved.device).repeat(len(moved), 1, 1)
+        R, away = torch.linalg.matrix_exp(-skew(moved[:, 3:FRAME])), data.points.nanmean(1) - centre
+        shrunk = moved[:, GROWTH : GROWTH + 1] * away
+        T[:, :3, :3] = R
+        T[:, :3, 3] = centre - (R @ (centre + moved[:, :3])[..., None])[..., 0] - shrunk
+        return with_attributes(data.in_frames(T), q=data.q + moved[:, OFFSETS:]).with_covariates()
+
+    def _drifted(self, places: Tensor, moved: Tensor) -> Tensor:
+        away = places - self.centre.to(places)
+        R = torch.linalg.matrix_exp(skew(moved[:, 3:FRAME]))
+        grown = (1.0 + moved[:, GROWTH, None, None]) * (away @ R.mT)
+        return self.centre.to(places) + moved[:, None, :3] + grown
+
+    def holds(self) -> str:
+        """For which values the model itself holds."""
+        middles = (0.5 * (self.lowest + self.highest)).tolist()
+        return " and ".join(f"{name} {middle:g}" for name, middle in zip(self.names, middles, strict=True))
+
+    @property
+    def of_another_date(self) -> str:
+        """Why it is not applied to rows of another date."""
+        return f"the drift with {' and '.join(self.names)} is that of the rows of the fit"
+
+    def sentences(self) -> Iterator[str]:
+        """How much drifted with each column, of what is known well, and for what the model holds."""
+        for number, name in enumerate(self.names):
+            low, high = float(self.lowest[number]), float(self.highest[number])
+            what = ", ".join(self._known(number)) or "no single cause stands out"
+            yield f"drift with {name} from {low:g} to {high:g}: {what}; the model holds for {0.5 * (low + high):g}"
+
+    def in_rows(self, data: Any) -> Iterator[str]:
+        """What is done about the drift in rows that are judged."""
+        told = [name for name in self.names if name in data.drifting]
+        if told:
+            yield f"the drift with {' and '.join(told)} that the fit found is part of the predictions of these rows"
+        if len(told) < len(self.names):
+            yield f"rows without {' and '.join(self.names)} are judged as if measured at {self.holds()}"
+        for name, low, high in zip(self.names, self.lowest, self.highest, strict=True):
+            values = data.drifting.get(name)
+            outside = 0 if values is None else int(((values < low) | (values > high)).sum())
+            if outside:
+                yield (
+                    f"{outside} rows have {name} outside of {float(low):g} to {float(high):g}, the rows of the fit: "
+                    "the drift is taken to stay as it was at the nearer end"
+                )
+
+    def _known(self, column: int) -> Iterator[str]:
+        """The unknowns that differ from zero."""
+        u, sd = self.sizes[column], self.deviations[column]
+        for part, what, unit in ((slice(0, 3), "shift", "mm"), (slice(3, FRAME), "turn", "mrad")):
+            if float((u[part] / sd[part]).abs().max()) > SURE:
+                yield f"the measuring frame by a {what} of {1e3 * float(u[part].norm()):.2g} {unit}"
+        if float(u[GROWTH].abs()) > SURE * float(sd[GROWTH]):
+            yield f"lengths by {1e6 * float(u[GROWTH]):+.2g} ppm"
+        offsets = zip(self.joints, u[OFFSETS:].tolist(), sd[OFFSETS:].tolist(), strict=True)
+        for (name, turns), own, deviation in offsets:
+            if abs(own) > SURE * deviation:
+                yield f"the offset of {name} by {1e3 * own:+.2g} +- {1e3 * deviation:.1g} {'mrad' if turns else 'mm'}"

@@ -1,0 +1,154 @@
+"""Commands and snippets of README and site run, on files of the names that they use; links lead somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import get_ur10_data
+import pytest
+from command_bank import Command
+from product_bank import simulated, simulated_poses
+from trackerless_bank import write_socket_table, write_wire_table
+from typer import Context
+from typer.main import get_command
+
+from diffeo_calib.cli.main import app
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+ROOT = Path(__file__).parents[1]
+README, PAGES = ROOT / "README.md", ROOT / "scripts/docs/pages"
+TEXTS = [README, *(PAGES / name for name in re.findall(r"[\w/]+\.md", (ROOT / "scripts/docs/mkdocs.yml").read_text()))]
+"""In the order of the site; pages that it makes itself are no files."""
+MOST_LINES = 130
+ELSEWHERE = {"camera.md": "scripts/examples/board_afternoon.py", "live.md": "tests/campaign"}
+"""Pages whose commands other tests run; here their options are checked."""
+
+
+def texts() -> dict[Path, str]:
+    return {path: path.read_text(encoding="utf-8") for path in TEXTS if path.is_file()}
+
+
+def snippets(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def commands(text: str) -> list[str]:
+    found = re.findall(r"^    (diffeo-calib (?:.*\\\n)*.*)$", text.replace("\\\n", " "), re.MULTILINE)
+    return [" ".join(command.split()) for command in found]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated arm and tables of its measurements under the names of the documentation."""
+    place = tmp_path_factory.mktemp("documentation")
+    arm, train, test = simulated(40)
+    arm.write_urdf(place / "robot.urdf")
+    names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
+    for name, data in (
+        ("measurements", train),
+        ("other", test[:60]),
+        ("joints", test[:60]),
+        ("program", test[:40]),
+        ("new", test[:15]),
+    ):
+        write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
+    write_socket_table(place / "block.csv", arm, "01", 0)
+    write_wire_table(place / "wire.csv", arm, 0)
+    posed = simulated_poses(30)[1]
+    rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
+    write_measurements(place / "poses.csv", posed, rotation)
+    source = os.environ.get("DIFFEO_CALIB_DATA")
+    if source:
+        get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
+    return place
+
+
+def test_the_readme_is_a_front_door() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert text.count("\n") <= MOST_LINES
+    assert len(snippets(text)) == 2
+    assert len(commands(text)) == 4
+
+
+def test_links_lead_somewhere() -> None:
+    made = {"commands.md", "benchmarks.md"}
+    for path, text in texts().items():
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+            assert (path.parent / target).is_file() or Path(target).name in made, (path.name, target)
+        for target in re.findall(r"(?<![\w/(])((?:scripts|benchmarks|tests|diffeo_calib)/[\w./]+\w)", text):
+            assert (ROOT / target).exists(), (path.name, target)
+
+
+def test_headings_of_links_are_there() -> None:
+    benchmarks = (ROOT / "benchmarks/README.md").read_text(encoding="utf-8")
+    headings = {re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in benchmarks.splitlines()}
+    for text in texts().values():
+        for anchor in re.findall(r"benchmarks/README\.md#([\w-]+)\)", text):
+            assert anchor in headings
+
+
+def test_every_page_is_in_the_site() -> None:
+    assert {path for path in TEXTS if path.is_file()} == {README, *PAGES.rglob("*.md")}
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_options_of_pages_that_run_elsewhere_are_known(name: str) -> None:
+    (text,) = (text for path, text in texts().items() if path.name == name)
+    assert commands(text)
+    known: Any = get_command(app)
+    for line in commands(text):
+        _, verb, *words = shlex.split(line)
+        command = known.commands[verb]
+        command.make_parser(Context(command)).parse_args(words)
+
+
+@pytest.mark.slow
+def test_snippets_run_one_after_the_other(folder: Path) -> None:
+    code = "\n".join(snippet for text in texts().values() for snippet in snippets(text))
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("converged") >= 2
+
+
+@pytest.mark.filterwarnings("ignore:the place of the marker on 'tool0' along")  # the tool's x axis is always vertical
+@pytest.mark.slow
+def test_commands_run_one_after_the_other(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the accuracy of the UR10 is what the text says."""
+    monkeypatch.chdir(folder)
+    whole = [line for path, text in texts().items() if path.name not in ELSEWHERE for line in commands(text)]
+    found = re.search(
+        r"632 poses; ([0-9.]+) mm RMS on the held-out rows of this split, geometry ([0-9.]+)", "".join(texts().values())
+    )
+    assert found is not None
+    ran = 0
+    for line in dict.fromkeys(whole):
+        program, *arguments = shlex.split(line)
+        assert program == "diffeo-calib"
+        if "--paper" in arguments:  # tests/paper
+            continue
+        real = any(word.startswith("data/") for word in arguments)
+        if real and not (folder / "data").is_dir():
+            continue
+        done = command(*arguments)
+        assert done.code == 0, (line, done.err)
+        if real:
+            rms = [done.numbers(stage, "190 held out")[0] for stage in ("diffeomorphic", "geometry")]
+            assert [f"{value:.3f}" for value in rms] == [found[1], found[2]]
+        ran += 1
+    assert ran >= 18
