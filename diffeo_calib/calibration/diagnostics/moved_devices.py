@@ -193,15 +193,14 @@ def change_during(
     rows, some = data.sample(len(data.x), limits.coordinates, seed)
     if len(rows) < 4 * limits.fewest_rows:
         return None
-    noise = float(some.new_noise(scales).diagonal().mean().sqrt())
-    causes = [one._replace(effects=one.effects[rows]) for one in (*causes_of(data), *devices())]
-    causes = [one.told_by(some) for one in causes if bool((one.effects != 0).any())]
-    some = some.told
-    order, dense = numbers.to(rows.device)[rows].argsort(), some.factorised(scales)
-    ratio = left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)
-    excess = max(1.0, float(ratio.nanmedian()))  # of errors that the scales understate
+    least = limits.noise_share * float(some.new_noise(scales).diagonal().mean().sqrt())
+    causes = _on_rows((*causes_of(data), *devices()), rows, some)
+    some, numbers = some.told, numbers.to(rows.device)[rows]
+    order, dense = numbers.argsort(), some.factorised(scales)
+    usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
+    excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
     found = findings(causes, dense, some.target, order, excess=excess, limits=limits)
-    found = [one for one in found if one.displacement > limits.noise_share * noise]
+    found = [one for one in found if one.displacement > least]
     if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
         return None
     best = max(found, key=lambda one: one.evidence)
@@ -209,18 +208,24 @@ def change_during(
     words = dict.fromkeys(one.words(limits) for one in (best, *others))
     before, after = (left_out_rms(known, some.target) for known in (dense, Beside(dense, best.columns)))
     if best.drifts and (moved := moved_twice(best, dense, some.target, order, limits)):
-        lines = " and ".join(str(int(numbers.to(rows.device)[rows[order[row]]])) for row in moved)
+        lines = " and ".join(str(int(numbers[order[row]])) for row in moved)
         what = f"{best.cause.name} seems to have moved more than once, near rows {lines}"
         return sentence(what, expected="one set-up for all rows", fix=f"check what happened then; {best.cause.fix}")
     if after > limits.worth * before:
         return None
-    where = "over the rows" if best.drifts else f"near row {int(numbers.to(rows.device)[rows[order[best.point.row]]])}"
+    where = "over the rows" if best.drifts else f"near row {int(numbers[order[best.point.row]])}"
     return sentence(
         f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
         expected="one set-up for all rows, in the order of their numbers",
         got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
         fix=SLOW if best.drifts else f"check what happened then; {best.cause.fix}",
     )
+
+
+def _on_rows(causes: Iterable[Cause], rows: Tensor, some: TangentData) -> list[Cause]:
+    """Those that move some of the rows, with effects on the numbers that these tell."""
+    own = [one._replace(effects=one.effects[rows]) for one in causes]
+    return [one.told_by(some) for one in own if bool((one.effects != 0).any())]
 
 
 class Beside:
