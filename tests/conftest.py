@@ -19,7 +19,15 @@ from typing import Any
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
-from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot, with_usual_scales
+from product_bank import (
+    Case,
+    calibrated,
+    calibrated_poses,
+    simulated,
+    sliding_measurements,
+    sliding_robot,
+    with_usual_scales,
+)
 
 import diffeo_calib as dc
 
@@ -31,9 +39,11 @@ def arm() -> Case:
 
 
 @pytest.fixture(scope="session")
-def arm_200() -> Case:
-    """The simulated arm, calibrated with 200 poses."""
-    return calibrated(200)
+def arm_200(arm: Case) -> Case:
+    """The simulated arm, calibrated with 200 poses and the scales of 60."""
+    robot, train, test = simulated(200)
+    scales = arm.result.selection.scales
+    return Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, hyperparameters=scales))
 
 
 @pytest.fixture(scope="session")

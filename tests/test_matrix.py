@@ -19,7 +19,7 @@ import jsonschema
 import pytest
 import torch
 from command_bank import Command, Outcome, leave_undrawn
-from kind_bank import FREE, KINDS, POSITIONED, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
+from kind_bank import FREE, KINDS, POSITIONED, QUICK, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -468,9 +468,6 @@ def _(bench: Bench) -> None:
 
 # --- the table ------------------------------------------------------------------------------------------------------
 
-LONG = ("fit", "fit --json --report --figure", "report", "compare two models", "recalibrate")
-"""Verbs of seconds: but for the kinds of THROUGHOUT they are slow tests."""
-
 PAIRS = [(verb, kind) for verb in VERBS for kind in KINDS]
 
 
@@ -488,8 +485,7 @@ def outcome(bench: Bench, name: str) -> str:
 
 
 def parameter(name: str, kind: str) -> Any:
-    slow = name in LONG and kind not in THROUGHOUT
-    return pytest.param(name, kind, id=f"{name}-{kind}", marks=[pytest.mark.slow] * slow)
+    return pytest.param(name, kind, id=f"{name}-{kind}", marks=[pytest.mark.slow] * (kind not in QUICK))
 
 
 @pytest.mark.parametrize(("name", "kind"), [parameter(*pair) for pair in PAIRS])

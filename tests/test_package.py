@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hatchling.builders.wheel import WheelBuilder
 
 import diffeo_calib as dc
 
@@ -99,3 +100,11 @@ def test_unknown_names_are_attribute_errors() -> None:
     with pytest.raises(ImportError, match="cannot import name 'calibarte'"):
         from diffeo_calib import calibarte  # noqa: F401  # pyright: ignore[reportAttributeAccessIssue]
     assert not hasattr(dc, "_calibrate")
+
+
+def test_the_wheel_holds_every_file_of_the_package() -> None:
+    """Its data too: URDF, JSON schema, C sources, templates."""
+    root = PACKAGE.parent
+    packed = {file.distribution_path for file in WheelBuilder(str(root)).recurse_included_files()}
+    there = {path.relative_to(root).as_posix() for path in PACKAGE.rglob("*.*") if "__pycache__" not in path.parts}
+    assert packed == {name for name in there if (root / name).is_file()}

@@ -42,6 +42,8 @@ class FreedomPrior:
 FREEDOM_PRIOR = FreedomPrior()
 GRID = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
+BLOCK = 1 << 16
+"""Numbers of the likelihood that are added at once."""
 CONFIDENCE = 0.95
 """Probability of the regions that :func:`region_factor` makes equally large."""
 
@@ -112,7 +114,8 @@ def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
     of_dim = {dim: squares} if isinstance(dim, int) else {int(k): squares[dim == k] for k in dim.unique()}
     for k, own in of_dim.items():
         half = (grid + k) / 2.0
-        distances = torch.stack([(own / nu).log1p().sum() for nu in grid])
+        parts = grid[:, None].split(max(1, BLOCK // max(1, own.numel())))
+        distances = torch.cat([(own / nu).log1p().sum(1) for nu in parts])
         density = torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * k * grid.log()
         value = value + own.numel() * density - half * distances
     return float(grid[int(value.argmax())])

@@ -126,7 +126,7 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
-        fix += 'column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading'
+        fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
     named = [name for name in sheet.header if name not in joints]
     session = None if sockets and not readings else guess_column(named, SESSIONS)

@@ -8,12 +8,12 @@ robotics", 2018.
 
 from __future__ import annotations
 
-from math import atan2, cos, sin
+from math import atan2, cos, pi, sin
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.chain import smooth
 
@@ -33,8 +33,8 @@ def rotation(w: Tensor) -> Tensor:
     """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     one = torch.eye(3, dtype=w.dtype, device=w.device)
-    sine = smooth(x, 1, lambda a: a.sin() / a, torch.where)
-    return one + sine * W + smooth(x, 2, _versine, torch.where) * (W @ W)
+    sine, versine = _sine_and_versine(x)
+    return one + sine * W + versine * (W @ W)
 
 
 def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -63,11 +63,7 @@ def right_jacobian(w: Tensor) -> Tensor:
     """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     one = torch.eye(3, dtype=w.dtype, device=w.device)
-    return (
-        one
-        - smooth(x, 2, _versine, torch.where) * W
-        + smooth(x, 3, lambda a: (a - a.sin()) / a**3, torch.where) * (W @ W)
-    )
+    return one - _sine_and_versine(x)[1] * W + smooth(x, 3, lambda a: (a - a.sin()) / a**3, torch.where) * (W @ W)
 
 
 def transforms(rotations: Tensor, translations: Tensor) -> Tensor:
@@ -111,6 +107,14 @@ def rigid(value: object, name: str) -> Tensor:
         expected = "a rigid transform [[R, t], [0, 0, 0, 1]] with R^T R = 1 and det R = 1"
         raise RobotError.of(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix")
     return matrix
+
+
+def _sine_and_versine(x: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(a) / a and (1 - cos a) / a^2 for x = a^2; by a fifth of the operations where x is not differentiated."""
+    if x.requires_grad or wrapped(x):
+        return smooth(x, 1, lambda a: a.sin() / a, torch.where), smooth(x, 2, _versine, torch.where)
+    a = x.sqrt() / pi
+    return torch.sinc(a), 0.5 * torch.sinc(0.5 * a).square()
 
 
 def _versine(a: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from typing import Any
 import golden_bank
 import inclinometer
 import laser_line
+import pytest
 import reading_bank
 import torch
 import two_arms_bank
@@ -152,12 +153,19 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "inclinations": _inclinations,
 }
 KINDS = tuple(SOURCES)
+QUICK = ("positions", "poses", "mixture", "heights")
+"""Kinds that every run tests; those of the others are slow tests."""
 POSITIONED = ("positions", "hidden markers")
 """Kinds whose tables are joint values and coordinates, and nothing else."""
 FREE = ("ball in sockets", "distances", "heights", "images")
 """Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
 CAMERAS = ("camera on the tool", "images of a board")
+
+
+def marked(*names: str) -> list[Any]:
+    """Kinds as parameters of a test."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in names]
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,6 +75,7 @@ def test_hidden_markers_do_not_count() -> None:
     assert differing_factor(hidden, mean, seen) == pytest.approx(differing_factor(other, mean, seen), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_camera_s_poses_lie_in_the_regions_of_their_noise() -> None:
     """Errors of drawn poses of the board, turned into poses of the camera with its own formulas."""
     seen = camera_arm(1500, 2)

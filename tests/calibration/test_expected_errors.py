@@ -10,7 +10,7 @@ import pytest
 import torch
 from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
-from kind_bank import KINDS, kind_named
+from kind_bank import KINDS, kind_named, marked
 from product_bank import with_usual_scales
 from torch import Tensor
 
@@ -66,6 +66,7 @@ def test_residual_and_shifts_of_a_fit_leave_its_noise() -> None:
     assert float(fit.shifts.norm()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tool never turned", "tool turned about the vertical"])
 def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -> None:
     """The truth differs from the model as expected, after the marker has been put where it fits best."""
@@ -91,7 +92,7 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -
     assert again.open_places
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", marked(*KINDS))
 def test_usual_rows_leave_no_place_open(name: str) -> None:
     found = ExpectedError.of(kind_named(name).model)
     assert found.open_places == ()

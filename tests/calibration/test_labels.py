@@ -28,6 +28,7 @@ def measured(payload: Tensor | None = None) -> dc.Measurements:
     return dc.Measurements(*ARM.measure(ROWS, seed=1, payload=payload))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [0, 3])
 def test_a_session_that_begins_earlier_than_said(late: int) -> None:
     whole = measured()

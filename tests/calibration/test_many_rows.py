@@ -65,6 +65,7 @@ def test_geometry_of_a_sample_weighs_all_rows(data: dc.Measurements, monkeypatch
     assert float(apart.square().mean().sqrt()) < whole.rms
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_calibration_of_many_rows(data: dc.Measurements) -> None:
     """All rows are fitted, weighed and judged, and the wrong one is found although the sample is without it."""

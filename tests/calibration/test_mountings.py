@@ -90,6 +90,7 @@ def test_the_marker_of_each_session_is_predicted(result: dc.CalibrationResult) -
         assert float((squares < 7.81).double().mean()) > 0.9
 
 
+@pytest.mark.slow
 def test_a_marker_that_a_session_hides() -> None:
     """It is where it was, and nothing is predicted of it there."""
     arm = SimulatedArm(seed=1, markers=2)
@@ -105,6 +106,7 @@ def test_a_marker_that_a_session_hides() -> None:
     assert dc.evaluate(found.model, data).rms < 1e-4
 
 
+@pytest.mark.slow
 def test_a_year_later(result: dc.CalibrationResult) -> None:
     """The device stands elsewhere, and the marker was mounted anew twice more."""
     T = twist_transform(torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64))
@@ -116,6 +118,7 @@ def test_a_year_later(result: dc.CalibrationResult) -> None:
         assert dc.evaluate(model, moved).rms < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("said", [False, True])
 def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None:
     """Frames are taken for markers, and markers for frames."""

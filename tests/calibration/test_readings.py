@@ -190,6 +190,7 @@ def test_a_tool_that_never_tilts_is_warned_about() -> None:
     assert "the tool is hardly tilted" in calibrated(arm, data)[1]
 
 
+@pytest.mark.slow
 def test_readings_in_another_unit_are_refused() -> None:
     arm = SimulatedArm(2)
     wide, narrow = readings(arm, "height", 60), touched(arm, (-0.008, 0.0, 0.008), 60)
@@ -211,6 +212,7 @@ def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None
     assert found.identification.rms < 0.3e-3 < found.registration.rms < 1e-3
 
 
+@pytest.mark.slow
 def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
     arm = SimulatedArm(2)
     exact = readings(arm, "distance", 90, noise=2e-5)

@@ -257,6 +257,7 @@ def test_tools_without_rigid_motions(result: dc.CalibrationResult, arm: Simulate
     assert float(base[:, :3, :3].diagonal(dim1=1, dim2=2).amax()) < 2e-6
 
 
+@pytest.mark.slow
 def test_few_control_points(arm: SimulatedArm, data: dc.Measurements, result: dc.CalibrationResult) -> None:
     scales = result.selection.scales
     coarse = dc.calibrate(arm.nominal, data, controls=100, hyperparameters=scales).sockets

@@ -326,6 +326,7 @@ def test_an_edited_file_is_kept(tmp_path: Path, command: Command) -> None:
     assert "holdout" not in (tmp_path / "c.toml").read_text()
 
 
+@pytest.mark.slow
 def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> None:
     arm = SimulatedArm(seed=3)
     arm.write_urdf(tmp_path / "arm.urdf")
@@ -350,6 +351,7 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
 def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Command) -> None:
     """The options that `init` writes read the table as those that wrote it."""
@@ -412,6 +414,7 @@ def test_columns_of_kinds_from_outside_the_package() -> None:
     assert not guess_readings(["inclination_1_deg", "inclination_2_deg", "line"])
 
 
+@pytest.mark.slow
 def test_a_kind_from_outside_alone(tmp_path: Path, command: Command) -> None:
     """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
     said = {}

@@ -66,6 +66,7 @@ def program(site: Site, model: dc.CalibratedKinematics, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_program_of_commands(
     site: Site, model: dc.CalibratedKinematics, program: Path, tmp_path: Path, command: Command
 ) -> None:

@@ -25,6 +25,9 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
+VERDICT = (STAGES[2], 0), (STAGES[2], 2), (STAGES[1], 0)
+"""Stage and place of the numbers of the first line."""
+
 
 def test_fit_prints_three_stages_in_training_and_held_out(
     fitted: Outcome, site: Site, model: dc.CalibratedKinematics
@@ -39,21 +42,27 @@ def test_fit_prints_three_stages_in_training_and_held_out(
         assert fitted.numbers(STAGES[2], label) == pytest.approx(expected, abs=1.01e-4)
     assert "Position errors in mm by stage" in fitted.out
     assert "converged" in fitted.out
-    residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", fitted.out)
+    assert "look wrong" not in fitted.out
+    assert model.report["outliers"] == 0
+    rms, most, before = (f"{fitted.numbers(stage, '12 held out')[k]:.3f}" for stage, k in VERDICT)
+    assert fitted.out.startswith(f"held out: {rms} mm RMS, 95 % below {most} (12 rows; geometry alone {before} mm RMS)")
+
+
+def test_fit_prints_the_solver_and_what_each_part_explains_if_asked(
+    small_site: Site, command: Command, tmp_path: Path
+) -> None:
+    done = command("--verbose", *small_site.fit(small_site.csv, tmp_path / "m.safetensors", "--holdout", "0"))
+    residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", done.out)
     assert residuals is not None
     assert all(float(value) <= 1e-4 for value in residuals.groups())
-
-
-def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.CalibratedKinematics) -> None:
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in fitted.out.splitlines() if "│" in line]
+    model: Any = dc.load(tmp_path / "m.safetensors")
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines() if "│" in line]
     printed = {row[0]: row[1:] for row in rows if len(row) == 3}
     found = parts(model)
     assert list(printed) == [part.name for part in found]
     for part in found:
         angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
         assert printed[part.name] == [f"{1e3 * part.displacement:.4f}", angle]
-    assert "look wrong" not in fitted.out
-    assert model.report["outliers"] == 0
     assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
 
 

@@ -64,6 +64,7 @@ def test_numbers_are_those_of_the_geometry(arm: Case) -> None:
     assert found.rms < found.validated[found.how] < nominal_kinematics(model).rms
 
 
+@pytest.mark.slow
 def test_it_is_better_than_the_model_s_geometry_left_alone(arm_200: Case) -> None:
     """On poses that nothing has seen, against the true robot; and as good as the calibration's geometry stage."""
     q, points = arm_200.test.q, arm_200.test.points
@@ -74,6 +75,7 @@ def test_it_is_better_than_the_model_s_geometry_left_alone(arm_200: Case) -> Non
     assert errors[0] < 1.03 * errors[2]
 
 
+@pytest.mark.slow
 def test_cross_validation_predicts_the_error_elsewhere(arm_200: Case) -> None:
     found = rigid_kinematics(arm_200.model)
     elsewhere = rms(found.geometry.points(arm_200.test.q), arm_200.model(arm_200.test.q))

@@ -11,7 +11,7 @@ from product_bank import ur10_measurements
 import diffeo_calib as dc
 from diffeo_calib.robots.se3 import twist_transform
 
-DRAWS = 3
+DRAWS = 2
 
 
 @pytest.mark.slow

@@ -220,6 +220,7 @@ def test_conditioning_by_iteration_has_no_features() -> None:
         iterated.features(at.linearise())
 
 
+@pytest.mark.slow
 @every_problem
 def test_control_points_in_many_blocks_of_data(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """One row per block or all rows at once, one pass over the data or two: the same optimum."""

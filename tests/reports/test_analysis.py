@@ -281,6 +281,6 @@ def test_the_marker_is_blamed_only_where_knowing_it_would_help(arm_200: Case) ->
     rows = FitRows(arm_200.model)
     tool = torch.arange(arm_200.model.nominal.geometry.size)[arm_200.model.nominal.geometry.slices["tool"]]
     assert float(rows.map.parameter_covariance(tool).diagonal().max()) > 1e-8
-    assert rows.map.explained_by(tool, arm_200.test.q[:40]) < 0.1
     every = torch.arange(arm_200.model.nominal.parameters)
-    assert 0.1 < rows.map.explained_by(every, arm_200.test.q[:40]) < 1.0
+    of_tool, of_all = (rows.map.explained_by(which, arm_200.test.q[:40]) for which in (tool, every))
+    assert of_tool < 0.5 * of_all < 0.5

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import simulated_camera
 
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -19,9 +20,10 @@ EXAMPLES = sorted((ROOT / "scripts" / "examples").glob("*.py"))
 def test_examples_run(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With at most 80 simulated rows."""
-    measure = SimulatedArm.measure
-    monkeypatch.setattr(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 80), seed=seed))
+    """With at most 50 simulated rows, and 18 images."""
+    measure, seen = SimulatedArm.measure, simulated_camera.camera_arm
+    monkeypatch.setattr(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 50), seed=seed))
+    monkeypatch.setattr(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 18)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(example)])
     runpy.run_path(str(example), run_name="__main__")

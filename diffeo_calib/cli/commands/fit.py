@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from diffeo_calib.cli.printed import (
 )
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.common.errors import printable
+from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -99,6 +100,8 @@ def run(
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**({} if hand_eye is None else {"hand_eye": hand_eye.entry()}))
     _record(result, in_train, held_out, vars(outputs))
+    for line in _verdict(result, held_out or {}):
+        say(line)
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
     wrong = [] if held_out is None else _contradicted(result.model, held_out)
@@ -113,6 +116,18 @@ def run(
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
     _end(result, in_train, held_out or in_train)
+
+
+def _verdict(result: CalibrationResult, held_out: Errors) -> Iterator[str]:
+    """How accurate the robot is now, first of all: by measured positions, or by what the model expects."""
+    judged = [one.stages for one in held_out.values() if one.one.what == ERRORS]
+    for stage in judged:
+        geometry, model = stage["geometry"], stage["diffeomorphic"]
+        unit, per_unit = model.shown
+        rms, most, before = (f"{per_unit * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
+        yield f"held out: {rms} {unit} RMS, 95 % below {most} ({model.count} rows; geometry alone {before} {unit} RMS)"
+    if not judged:
+        yield stage_line(result.model, result.stages, result.expected)
 
 
 def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
@@ -157,7 +172,8 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    yield stage_line(result.model, result.stages, result.expected)
+    if any(one.one.what == ERRORS for one in (held_out or {}).values()):  # else they are the verdict
+        yield stage_line(result.model, result.stages, result.expected)
     yield from expectation_lines(result.model, data, result.expected)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
@@ -248,17 +264,26 @@ def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> No
 
 
 def _show_findings(result: CalibrationResult, rows: int) -> None:
-    """Print what each part explains, the rows that look wrong, and how the fit ended."""
-    out.print(parts_table(result.parts))
+    """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
+    detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
+    if detailed:
+        out.print(parts_table(result.parts))
     for wave in result.gear_lines:
         say(wave.sentence)
     for line in outlier_lines(result.outliers, rows):
         say(line)
+    say(result.status)
+    if detailed:
+        for line in _solver_lines(result):
+            say(line)
+
+
+def _solver_lines(result: CalibrationResult) -> Iterator[str]:
+    """How many parameters the fit has, and how well it solves its equations."""
     left_out, fitted = result.leave_one_out, result.fit
     if left_out.effective is not None:
-        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
-    say(result.status)
-    say(
+        yield f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates"
+    yield (
         f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
         f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
     )

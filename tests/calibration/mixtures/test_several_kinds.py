@@ -62,7 +62,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * ("images" in name)) for name in CASES])
 def test_as_accurate_as_expected(name: str) -> None:
     """Better than geometry, and as good as the model says; errors of every kind are judged by themselves."""
     parts = CASES[name]()
@@ -82,6 +82,7 @@ def joint() -> dc.CalibrationResult:
     return calibrated([positions(25), read("distance", 36), read("height", 24), read("image", 24)])
 
 
+@pytest.mark.slow
 def test_devices_are_where_they_are_within_their_deviations(joint: dc.CalibrationResult) -> None:
     """Three fixed points in the tracker's frame, and the ball as a marker of its own."""
     base = ARM.truth.base
@@ -96,6 +97,7 @@ def test_devices_are_where_they_are_within_their_deviations(joint: dc.Calibratio
     assert "mm in the measuring frame" in joint.placement.sentences()[0]
 
 
+@pytest.mark.slow
 def test_the_order_of_the_rows_does_not_matter() -> None:
     data = dc.Observations.joined([positions(25), read("height", 24), read("image", 24)])
     order = torch.randperm(len(data), generator=torch.Generator().manual_seed(1))
@@ -107,6 +109,7 @@ def test_the_order_of_the_rows_does_not_matter() -> None:
     torch.testing.assert_close(other, one, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_payloads() -> None:
     def laden(data: dc.Measurements | dc.Readings) -> object:
         return data.with_payload(torch.tensor([0.0, 2.0, 5.0], dtype=torch.float64)[torch.arange(len(data)) % 3])
@@ -131,6 +134,7 @@ def test_sessions() -> None:
     assert rms(ball_errors(result, free=False)) < 2 * result.expected.workspace
 
 
+@pytest.mark.slow
 def test_controls() -> None:
     """Fewer momenta than rows: the deviations of devices are found as well."""
     whole = calibrated([positions(25), read("distance", 36)])
