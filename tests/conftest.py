@@ -16,6 +16,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process that a tes
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
@@ -26,6 +27,7 @@ from product_bank import (
     simulated,
     sliding_measurements,
     sliding_robot,
+    ur10_measurements,
     with_usual_scales,
 )
 
@@ -151,3 +153,13 @@ def ur10_folder() -> Path:
     if not folder or not (Path(folder) / "ipa_ur10").is_dir():
         pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
     return Path(folder) / "ipa_ur10"
+
+
+@pytest.fixture(scope="session")
+def ur10_150(ur10_folder: Path) -> Case:
+    """That UR10, calibrated with 150 of 442 rows, the usual ones held out."""
+    robot, data = ur10_measurements(ur10_folder)
+    train, test = data.split(0.7, seed=0)
+    some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
+    some = dc.Measurements(some.q, some.points)
+    return Case(robot, some, test, dc.calibrate(robot, some))

@@ -6,6 +6,7 @@ import ast
 import io
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import diffeo_calib
@@ -21,6 +22,7 @@ FILES = sorted(
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@cache
 def lines_with_code(source: str) -> set[int]:
     """Lines that hold more than comments and blanks."""
     blank = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
@@ -31,9 +33,12 @@ def lines_with_code(source: str) -> set[int]:
     return lines
 
 
-def code_lines(function: Function, lines: set[int]) -> int:
-    """Number of these lines that belong to a function, without its docstring."""
-    own = lines & set(range(function.lineno, (function.end_lineno or 0) + 1))
+def code_lines(function: Function, source: str) -> int:
+    """Number of lines with code that belong to a function, without its docstring; at most those that it spans."""
+    last = function.end_lineno or 0
+    if last - function.lineno < MOST_CODE_LINES:
+        return last - function.lineno + 1
+    own = lines_with_code(source) & set(range(function.lineno, last + 1))
     if ast.get_docstring(function) is not None:
         first = function.body[0]
         own -= set(range(first.lineno, (first.end_lineno or 0) + 1))
@@ -57,13 +62,13 @@ def too_big(path: Path, source: str) -> Iterator[str]:
     """What is too long in a file, and which functions have too many parameters."""
     if source.count("\n") > MOST_LINES:
         yield f"{path}: {source.count(chr(10))} lines: split the file by subject"
-    tree, lines = ast.parse(source), lines_with_code(source)
+    tree = ast.parse(source)
     owners = {child: node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for child in node.body}
     for node in ast.walk(tree):
         if isinstance(node, Function):
             place = f"{path}, line {node.lineno}"
-            if code_lines(node, lines) > MOST_CODE_LINES:
-                yield f"{place}: {code_lines(node, lines)} lines of code: split {node.name}"
+            if code_lines(node, source) > MOST_CODE_LINES:
+                yield f"{place}: {code_lines(node, source)} lines of code: split {node.name}"
             if parameters(node) > MOST_PARAMETERS and not may_have_many(node, owners.get(node, "")):
                 yield f"{place}: group the parameters of {node.name}"
 
@@ -76,10 +81,11 @@ def test_small_pieces() -> None:
 
 
 def test_sizes_are_measured() -> None:
-    source = 'def f(self, a, *, b):\n    """One\n    two."""\n    # three\n\n    return (\n        a\n    )\n'
+    longer = MOST_CODE_LINES * "    # four\n"
+    source = f'def f(self, a, *, b):\n    """One\n    two."""\n{longer}\n    return (\n        a\n    )\n'
     (function,) = ast.parse(source).body
     assert isinstance(function, ast.FunctionDef)
-    assert code_lines(function, lines_with_code(source)) == 4
+    assert code_lines(function, source) == 4
     assert parameters(function) == 2
 
 

@@ -8,7 +8,8 @@ calibration, 40 more by its plan, and so on. The true error is that of the calib
 row is found by bisection between 20 and 160 in steps of 4, and by interpolation between these.
 
 Fields of a record: `seed`, `poses`, `target_mm`; `rows`: first row at which the true error is below the target; none:
-not within 160. Of a campaign `stopped`: row at which the expected error is below it, and `true_mm` there.
+not within 160. Of a campaign with this goal `stopped`: row at which it is reached, and `true_mm` there; `expected`: row
+at which the expected error is below it, which may be too early.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from math import exp, log
 
@@ -34,7 +35,8 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 MOST, FIRST, STEP = 160, 20, 4
 TARGETS_MM = (0.1, 0.05)
-COLUMNS = ("seed", "poses", "target_mm", "rows", "stopped", "true_mm")
+POSES = ("random", "beforehand", "campaign")
+COLUMNS = ("seed", "poses", "target_mm", "rows", "stopped", "true_mm", "expected")
 
 
 def measured(arm: SimulatedArm, q: Tensor, seed: int) -> Tensor:
@@ -43,17 +45,20 @@ def measured(arm: SimulatedArm, q: Tensor, seed: int) -> Tensor:
     return arm.true_points(q) + arm.noise * torch.from_numpy(noise.standard_normal((len(q), 1, 3)))
 
 
-def by_campaign(arm: SimulatedArm, seed: int, candidates: Tensor, target: Tensor) -> tuple[Tensor, Tensor, list[float]]:
-    """Joint values, positions, and the expected error after each row, mm."""
-    campaign = dc.Campaign(arm.nominal, candidates=candidates, target=target)
-    first, q, y, expected = arm.sample(12, seed=seed + 4000), [], [], []
-    while len(q) < MOST and not (expected and expected[-1] <= 0.8 * TARGETS_MM[-1]):
+def by_campaign(
+    arm: SimulatedArm, seed: int, candidates: Tensor, target: Tensor, goal: float
+) -> tuple[Tensor, Tensor, int | None, int | None]:
+    """Joint values, positions, and the rows at which the goal [mm] is reached, and expected."""
+    campaign = dc.Campaign(arm.nominal, candidates=candidates, target=target, goal=1e-3 * goal)
+    first, q, y, expected = arm.sample(12, seed=seed + 4000), [], [], None
+    while len(q) < MOST and not campaign.reached:
         found = campaign.next(1)
         q.append(first[len(q)] if found is None else found.q[0])
         y.append(measured(arm, q[-1][None], seed + len(q))[0])
         campaign.add(q[-1], y[-1])
-        expected.append(1e3 * (campaign.expected_error or 1.0))
-    return torch.stack(q), torch.stack(y), expected
+        if expected is None and 1e3 * (campaign.expected_error or 1.0) <= goal:
+            expected = len(q)
+    return torch.stack(q), torch.stack(y), len(q) if campaign.reached else None, expected
 
 
 def beforehand(arm: SimulatedArm, seed: int, candidates: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,19 +92,19 @@ def first_below(error: Callable[[int], float], goal: float, most: int) -> float 
     return exp(log(low) + share * log(high / low))
 
 
-def arms(seed: int) -> Iterator[Record]:
-    """One arm, measured in three ways."""
+def arms(seed: int, names: Sequence[str]) -> Iterator[Record]:
+    """One arm, measured in some ways."""
     arm = SimulatedArm(seed)
     candidates, target = arm.sample(200, seed=seed + 2000), arm.sample(200, seed=seed + 3000)
     random = arm.sample(MOST, seed=seed + 5000)
-    ways = {"random": lambda: (random, measured(arm, random, seed), [])}
-    ways["beforehand"] = lambda: (*beforehand(arm, seed, candidates, target), [])
-    ways["campaign"] = lambda: by_campaign(arm, seed, candidates, target)
-    for name, way in ways.items():
-        q, y, expected = way()
-        error = cache(partial(lambda q, y, rows: error_mm(arm, target, q[:rows], y[:rows]), q, y))
+    ways = {"random": lambda _: (random, measured(arm, random, seed), None, None)}
+    once = cache(lambda: beforehand(arm, seed, candidates, target))
+    ways["beforehand"] = lambda _: (*once(), None, None)
+    ways["campaign"] = lambda goal: by_campaign(arm, seed, candidates, target, goal)
+    for name in names:
         for goal in TARGETS_MM:
-            stopped = next((row for row, value in enumerate(expected, 1) if value <= goal), None)
+            q, y, stopped, expected = ways[name](goal)
+            error = cache(partial(lambda q, y, rows: error_mm(arm, target, q[:rows], y[:rows]), q, y))
             yield {
                 "seed": seed,
                 "poses": name,
@@ -107,6 +112,7 @@ def arms(seed: int) -> Iterator[Record]:
                 "rows": first_below(error, goal, len(q)),
                 "stopped": stopped,
                 "true_mm": None if stopped is None else error(stopped),
+                "expected": expected,
             }
 
 
@@ -114,7 +120,10 @@ if __name__ == "__main__":
     parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=harness.count, default=10, help="number of arms")
     parser.add_argument("--first", type=int, default=0, help="the first of them")
+    parser.add_argument("--poses", choices=POSES, action="append", help="only these; may be repeated")
     given = parser.parse_args()
     warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
     seeds = range(given.first, given.first + (1 if given.quick else given.seeds))
-    harness.guarded(partial(harness.report, (one for seed in seeds for one in arms(seed)), given.out, COLUMNS))  # pyright: ignore[reportArgumentType]
+    harness.guarded(
+        partial(harness.report, (one for seed in seeds for one in arms(seed, given.poses or POSES)), given.out, COLUMNS)
+    )  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,7 @@ import base64
 import csv
 import html
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ IMAGE = "image"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 THUMBNAIL = 320
 """Width of an image in the overview, pixels."""
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +89,15 @@ class Folder:
         return f"<!doctype html><meta charset=utf-8><title>{head}</title><style>{style}</style><h1>{head}</h1>{cells}"
 
 
-def read_folder(folder: Path, joints: Path, board: Board, sep: str = ",") -> Folder:
+def read_folder(
+    folder: Path, joints: Path, board: Board, sep: str = ",", progress: Progress = lambda *_: None
+) -> Folder:
     """Find a board in the images of a table of joint values.
 
     Args:
         folder: of the images. joints: a table with a header; its column `image` names the file of each row, without
             one the rows are those of the files in alphabetical order. board: to look for. sep: between cells.
+        progress: called as ``progress(task, done, total)``.
 
     Raises:
         MeasurementError: rows and images that do not belong to one another, or no image that shows the board.
@@ -104,7 +108,10 @@ def read_folder(folder: Path, joints: Path, board: Board, sep: str = ",") -> Fol
     if not sizes:
         raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
     usual = sizes.most_common(1)[0][0]
-    images = [_seen(name, cells, image, board, usual) for name, cells, image in zip(names, rows, read, strict=True)]
+    images = []
+    for name, cells, image in zip(names, rows, read, strict=True):
+        progress("images", len(images), len(names))
+        images.append(_seen(name, cells, image, board, usual))
     found = Folder(board, header, images, (usual[1], usual[0]))
     if not found.used:
         reasons = few([f"{one.name}: {one.refused}" for one in images])

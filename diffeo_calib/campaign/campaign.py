@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from threading import Thread
 from typing import Any
 
@@ -21,7 +22,7 @@ from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.campaign.model import CampaignModel
 from diffeo_calib.campaign.planned import Next, planned
 from diffeo_calib.campaign.verdicts import Verdict
-from diffeo_calib.common.checks import check_seed
+from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
 from diffeo_calib.common.threads import small_work
@@ -33,8 +34,10 @@ FIRST_ROWS = 12
 """Accepted rows of the first model."""
 GROWTH = 1.5
 """Factor by which the accepted rows grow between two models."""
-FIRST_SCALES = 20
-"""Accepted rows at which scales are selected first; then at twice as many."""
+FIRST_SCALES, SCALES_GROWTH = 20, 2.0
+"""Accepted rows at which scales are selected first; factor by which these grow until they are selected again."""
+NEAR, NEAR_GROWTH = 1.5, 1.15
+"""Expected error, relative to the goal, from which on scales are selected more often, and the factor there."""
 CANDIDATES, TARGETS = 120, 40
 """Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
 SAME_POSE = 5e-3
@@ -49,6 +52,7 @@ class Campaign:
         robot: nominal chain, n joints.
         candidates: (M, n) configurations that can be measured, rad or m; drawn within the joint limits by default.
         target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
+        goal: RMS error over the target to reach, m, see :attr:`reached`.
         background: whether models are renewed in a thread of their own: a call then never waits for one, and verdicts
             depend on when it ends. By default a call that is due for a new model makes it (some seconds).
         seed: of everything that is drawn.
@@ -67,11 +71,15 @@ class Campaign:
         *,
         candidates: object = None,
         target: object = None,
+        goal: float | None = None,
         background: bool = False,
         seed: int = 0,
     ) -> None:
         if not isinstance(robot, Tree):
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__)
+        if goal is not None:
+            check_number(goal, "`goal`", above=0.0)
+        self.goal = goal
         self.robot, self.seed, self.background = robot, check_seed(seed), background
         self.candidates = drawn(robot, CANDIDATES, seed=seed) if candidates is None else _joints(robot, candidates)
         self.target = self.candidates if target is None else _joints(robot, target)
@@ -101,6 +109,17 @@ class Campaign:
     def expected_error(self) -> float | None:
         """RMS error of the robot over the target as the accepted rows lead to expect, m; None before a first model."""
         return None if self._model is None else self._model.expected_error
+
+    @property
+    def error_limit(self) -> float | None:
+        """What that error exceeds with 5 % probability, m; None without a goal, and before 20 accepted rows."""
+        limit = inf if self._model is None else self._model.error_limit
+        return None if limit == inf else limit
+
+    @property
+    def reached(self) -> bool:
+        """Whether the error is below the goal: with 95 % probability, as the expected one may be wrong."""
+        return self.goal is not None and (self.error_limit or inf) <= self.goal
 
     @small_work()
     def add(self, q_or_table: object, y: object = None) -> list[Verdict]:
@@ -164,11 +183,13 @@ class Campaign:
         """Poses to measure again, then those that help most, greedily; and how many more rows an expected error takes.
 
         Args:
-            count: of poses. goal: expected error to reach, m.
+            count: of poses. goal: expected error to reach, m; by default that with which the goal is reached.
 
         Returns:
             None before a model, unless poses are to be measured again.
         """
+        if goal is None and self.goal is not None and self._model is not None:
+            goal = self.goal * self._model.expected_error / (self.error_limit or self._model.expected_error)
         again = [one.row for one in self.verdicts if one.again][:count]
         found = None if self._model is None else planned(self._model, count, goal)
         if not again:
@@ -216,7 +237,7 @@ class Campaign:
     def _renew(self) -> None:
         """Make a new model if it is due."""
         count, model = len(self.accepted), self._model
-        due = FIRST_ROWS if model is None else min(GROWTH * model.count, model.next_scales)
+        due = FIRST_ROWS if model is None else min(GROWTH * model.count, self._next_scales(model))
         if count < due or count == self._tried or self._maker is not None:
             return
         self._tried = count
@@ -228,19 +249,26 @@ class Campaign:
             self._make(*arguments)
             self.poll()
 
+    def _next_scales(self, model: CampaignModel) -> float:
+        """Accepted rows at which scales are selected again."""
+        near = self.goal is not None and model.expected_error < NEAR * self.goal
+        return max((NEAR_GROWTH if near else SCALES_GROWTH) * model.selected, FIRST_SCALES)
+
     @small_work()
     def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
         """A new model from accepted rows; without one if they do not allow it yet."""
         count, old = sum(one.accepted for one in verdicts), self._model
-        scales = None if old is None or count >= old.next_scales else old.scales
+        scales = None if old is None or count >= self._next_scales(old) else old.scales
         first = count < FIRST_SCALES
         asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
         try:
-            made = CampaignModel.of(self.robot, table, verdicts, asked, (scales, first, self.seed))
+            choice, certain = (scales, first, self.seed), self.goal is not None
+            made = CampaignModel.of(self.robot, table, verdicts, asked, choice, certain=certain)
         except DiffeoCalibError:
             return
         if old is not None and scales is not None:
             made.ratios = list(old.ratios)  # else new scales have yet to show how good they are
+            made.selected, made.deviation = old.selected, old.deviation
         self.models += 1
         self._made.append(made)
 

@@ -9,21 +9,23 @@ object names all columns of a table that is not there yet. A line without its ne
 Each line is answered by one, in order. A row that is answered is on the disk, with its verdict. ::
 
     {"id": 7, "line": 8, "fits": true, "accepted": true, "error_mm": 0.03, "usual_mm": 0.04, "cause": "",
-     "change": null, "text": "row 6 fits: ...", "revised": [], "expected_error_mm": 0.21, "more_rows": 14,
-     "target_reached": false, "next": [{"joint_1": 12.9, ..., "joint_6": -40.2}], "rows": 7, "accepted_rows": 7}
+     "change": null, "text": "row 8 fits: ...", "revised": [], "expected_error_mm": 0.21, "error_limit_mm": 0.27,
+     "more_rows": 14, "target_reached": false, "next": [{"joint_1": 12.9, ..., "joint_6": -40.2}], "rows": 7,
+     "accepted_rows": 7}
     {"id": 7, "error": "the line was not taken in, and why"}
 
 `line` is the row's line in the table, whose header is line 1; texts name rows by it. `fits` is null as long as there is
-no model; `more_rows` and `target_reached` belong to a target. `change`: what changed before the row (`line`, `cause`,
-`others`, `size`, `unit`, `fix`); `revised`: earlier rows taken in or left out by this.
+no model. `more_rows`, `target_reached` and `error_limit_mm`, which the error exceeds with 5 % probability and which
+decides, belong to a target. `change`: what changed before the row (`line`, `cause`, `others`, `size`, `unit`, `fix`);
+`revised`: earlier rows taken in or left out by this.
 
 `id` is optional: a number or a word that is a column of the table and tells rows apart. After a cut connection, a
 program sends the rows again that were not answered: a row whose id the table has is answered and not taken in again.
 
-Other objects: `{}` asks for the last six of these alone; `{"do": "reject", "line": 5}` leaves a row out, "accept" takes
-it in, "repeat" leaves it out and puts its pose first among the next. A socket answers `{}` by itself when a connection
-begins, and says `"ended": true` when the campaign ends. Where it needs a token, `{"token": "..."}` is the first line. A
-line that is no JSON object ends its connection: browsers, too, can send text to local ports.
+Other objects: `{}` asks for the last seven of these alone; `{"do": "reject", "line": 5}` leaves a row out, "accept"
+takes it in, "repeat" leaves it out and puts its pose first among the next. A socket answers `{}` by itself when a
+connection begins, and says `"ended": true` when the campaign ends. Where it needs a token, `{"token": "..."}` is the
+first line. A line that is no JSON object ends its connection: browsers, too, can send text to local ports.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import pi
+from math import inf, pi
 from typing import Any, NamedTuple
 
 import torch
@@ -18,8 +18,9 @@ from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
-from diffeo_calib.campaign.verdicts import LIMITS, Change, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
@@ -54,7 +55,8 @@ class CampaignModel:
 
     Args:
         placed: geometry and devices. data: the rows they were found with. scales: of the model.
-        next_scales: number of accepted rows at which scales are selected again. count: accepted rows of this model.
+        selected: accepted rows that the scales were selected with. count: those of this model.
+        deviation: of the log expected error by uncertain scales; infinite where they are not selected.
         seen: rows of the campaign at that time. asked: candidates (M, n) and target (T, n), rad or m.
         posterior: of the accepted rows but the last ones. window: numbers of the last rows.
         last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
@@ -64,7 +66,8 @@ class CampaignModel:
     placed: Placed
     data: TangentData
     scales: Hyperparameters
-    next_scales: int
+    selected: int
+    deviation: float
     count: int
     seen: int
     asked: tuple[Tensor, Tensor]
@@ -83,11 +86,14 @@ class CampaignModel:
         verdicts: Sequence[Verdict],
         asked: tuple[Tensor, Tensor],
         choice: tuple[Hyperparameters | None, bool, int],
+        *,
+        certain: bool = False,
     ) -> CampaignModel:
         """A model of the accepted rows.
 
         Args:
             choice: scales, None to select them; whether the rows are too few for that; a seed.
+            certain: whether to say how certain selected scales are.
 
         Raises:
             DiffeoCalibError: rows that do not allow a model yet.
@@ -99,19 +105,19 @@ class CampaignModel:
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
+            known = scales
             if scales is None and first:
-                scales = defaults(data, noise_of_few(data, len(numbers), *stages), placed.identification.prior)
-            if scales is not None:
-                scales = replace(scales, lines=())
-            chosen = choose_scales(data, rows, *stages, given=scales, seed=seed)
-        scales, data = chosen.selection.scales, chosen.data
-        next_scales = 20
-        while next_scales <= len(numbers):
-            next_scales *= 2
+                known = defaults(data, noise_of_few(data, len(numbers), *stages), placed.identification.prior)
+            if known is not None:
+                known = replace(known, lines=())
+            chosen = choose_scales(data, rows, *stages, given=known, seed=seed)
+        found, data = chosen.selection.scales, chosen.data
         later: Any = None
-        counts = next_scales, len(numbers), len(table)
-        bare = cls(placed, data, scales, *counts, asked, later, [], later, later, later, [])
-        return bare.rebuilt(table, verdicts)
+        counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
+        made = cls(placed, data, found, *counts, asked, later, [], later, later, later, []).rebuilt(table, verdicts)
+        if certain and known is None:
+            made.deviation = scales_deviation(data, found, made.target, made.compared)
+        return made
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
         """The same places and scales with the posterior of the rows that are accepted now."""
@@ -137,8 +143,18 @@ class CampaignModel:
     @property
     def expected_error(self) -> float:
         """RMS error over the target, m, of the markers, or of the origins of poses."""
+        return float((3 * self._covariance.diagonal().mean()).clamp(min=0).sqrt())
+
+    @property
+    def error_limit(self) -> float:
+        """What the error over the target exceeds with 5 % probability, m; infinite where that is not known."""
+        return limit_of(self.expected_error, self._covariance, self.deviation)
+
+    @property
+    def _covariance(self) -> Tensor:
+        """Covariance (T r, T r) of the errors over the target, m^2."""
         J = self.compared
-        return float((3 * ((J @ self.known(J.shape[1])) * J).sum(1).mean()).clamp(min=0).sqrt())
+        return J @ self.known(J.shape[1]) @ J.T
 
     def known(self, size: int | None = None) -> Tensor:
         """Covariance of the target and then of the candidates by all accepted rows, the first ``size`` numbers, m^2."""
@@ -173,7 +189,7 @@ class CampaignModel:
         cause = "" if fits else self._cause(table, around.data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        change = None if cause else self._change(around, seen, verdicts, typical)
+        change = None if cause else self._change(around, seen, verdicts, found, typical)
         if change is not None:
             change = replace(change, line=lines[change.row])
             for number in self.window:
@@ -206,11 +222,13 @@ class CampaignModel:
             self.last = self.posterior.see(self.last.rows, self.posterior.take(row, self.last))
         self.window, self.taken = self.window[1:], self.taken[1:]
 
-    def _change(self, around: Around, seen: Seen, verdicts: Sequence[Verdict], typical: float) -> Change | None:
+    def _change(
+        self, around: Around, seen: Seen, verdicts: Sequence[Verdict], single: Measure, typical: float
+    ) -> Change | None:
         """What changed among the last rows."""
         own = [verdicts[number] for number in self.window]
         known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        return find_change(seen, self.window, around.causes(), (known, doubted), typical=typical)
+        return find_change(seen, self.window, around.causes(), (known, doubted), single=single, typical=typical)
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -268,16 +286,18 @@ class CampaignModel:
 
     def _asked(self, table: Any) -> tuple[Rows, Rows]:
         """The target, and the candidates as if they were measured like the last row."""
-        candidates, target = self.asked
-        nominal = self.data.nominal.typical
-        like = replace(self.data, nominal=nominal, x=target, shared=None, observe=None, beside=None)
-        at = like.linearisation(self.scales)
+        candidates = self.asked[0]
+        last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
+        return self.target(self.scales), Rows.of(self.around(table, last, candidates).data, self.scales)
+
+    def target(self, scales: Hyperparameters) -> Rows:
+        """The places at which the robot shall be accurate."""
+        q, nominal = self.asked[1], self.data.nominal.typical
+        at = replace(self.data, nominal=nominal, x=q, shared=None, observe=None, beside=None).linearisation(scales)
         count, m = at.sensitivity.shape[:2]
         c = 0 if self.data.shared is None else self.data.shared.shape[2]
-        nothing, seen = target.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
-        there = Rows(at, target.new_zeros(count, m, c), target.new_zeros(count, m, m), nothing, seen)
-        last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
-        return there, Rows.of(self.around(table, last, candidates).data, self.scales)
+        nothing, seen = q.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
+        return Rows(at, q.new_zeros(count, m, c), q.new_zeros(count, m, m), nothing, seen)
 
 
 def with_joints(table: Any, q: Tensor) -> Any:

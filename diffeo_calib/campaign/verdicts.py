@@ -4,10 +4,11 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 
 * of one row: its unit, its joints are those of another row, two markers are exchanged, one marker is wrong. A cause is
   named if the row fits when it is undone.
-* from a row k on: a device has moved, a marker has slipped, a joint has another zero. With w = L^-1 e the whitened
+* from a row k on: a device has moved, a marker has slipped, a joint has another offset. With w = L^-1 e the whitened
   errors of the last rows in order and B the effects of a cause, zero before row k, the cause gains |P w|^2, P the
   projection onto L^-1 B; chance gains chi-squared (diagnostics/moved_devices.py). Rows that were taken in one by one
-  count again here: small changes show in several rows only.
+  count again here: small changes show in several rows only. A single wrong row, which six unknowns of a device explain
+  as well, is no change.
 """
 
 from __future__ import annotations
@@ -32,18 +33,20 @@ class JudgementLimits:
 
     Args:
         chance: probability that a right row counts as wrong. undone: the same once its mistake is undone.
-        change: probability that chance gains as much as a named change.
+        change: probability that chance gains as much as a named change. A campaign of 100 rows asks for about 10,000
+            changes, most of them much alike.
         remaining: probability, by chance, of the errors that a named change leaves.
         fewest_rows: rows after a change. window: last rows among which changes are sought.
         spare: numbers beyond the unknowns of a change that must show it.
         typical_rows: last accepted rows whose squares, at this share of them, say how large right ones are relative
             to chance; fewest_typical: of them, with fewer it is ``at_first``. A model of few rows is overconfident.
-        told_apart: gain by which a change must exceed that of another cause; else both are named.
+        told_apart: gain by which a change must exceed that of another cause; else both are named. By as much it must
+            exceed what is gained if nothing but the last row is wrong.
     """
 
     chance: float = 1e-8
     undone: float = 1e-3
-    change: float = 1e-9
+    change: float = 1e-6
     remaining: float = 1e-3
     fewest_rows: int = 2
     window: int = 12
@@ -178,6 +181,7 @@ def find_change(
     causes: Sequence[Cause],
     flags: tuple[Tensor, Tensor],
     *,
+    single: Measure,
     typical: float,
     limits: JudgementLimits = LIMITS,
 ) -> Change | None:
@@ -186,7 +190,7 @@ def find_change(
     Args:
         seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, m, U) on them, m.
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
-        typical: see :meth:`Measure.fits`.
+        single: the distance of the last row. typical: see :meth:`Measure.fits`.
     """
     known, doubted = flags
     owner, visible, found = seen.rows.owner, seen.rows.visible.flatten(), []
@@ -205,11 +209,13 @@ def find_change(
             fit = columns @ u
             gain, left = float(fit.square().sum()) / typical, float((white - fit).square().sum()) / typical
             if left <= chi2_above(limits.remaining, spare):
-                found.append((gain - B.shape[1] * log(len(white)), gain, first, cause, B @ u, u))
+                found.append((gain - B.shape[1] * log(len(white)), gain, first, cause, B @ u, u, len(white)))
     best = max(found, key=lambda one: one[0], default=None)
     if best is None or chi2_probability(best[1], len(best[5])) > limits.change:
         return None
-    score, _, first, cause, moved, u = best
+    score, _, first, cause, moved, u, count = best
+    if score < single.square / typical - single.freedom * log(count) + limits.told_apart:
+        return None
     others = {one[3].name for one in found if one[0] > score - limits.told_apart} - {cause.name}
     unit, size = cause.unit or ("mm", 1e-3)
     change = float(u.abs().max()) if cause.unit else float((3 * moved.square().mean()).sqrt())

@@ -23,7 +23,8 @@ from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TextCo
 from rich.progress import Progress as Bar
 from rich.text import Text
 
-from diffeo_calib.common.errors import PACKAGE, printable
+from diffeo_calib.cli.record import record
+from diffeo_calib.common.errors import PACKAGE, few, printable
 from diffeo_calib.common.files import remove_unfinished
 
 WIDTH = 160
@@ -39,6 +40,8 @@ WORDS = {
     "plan": "choosing poses",
     "analysis": "analysing",
     "drawing": "drawing the report",
+    "commands": "correcting commands",
+    "images": "looking for the board",
 }
 """Task of the library -> what it does."""
 LIMITED = ("hyper-parameters", "Gauss-Newton")
@@ -207,7 +210,7 @@ class Interrupts:
 
     def _handle(self, _signal: int, _frame: FrameType | None) -> None:
         if not self._keeping:
-            end_process(INTERRUPTED)
+            end_process(f"interrupted; written: {few(record.files)}" if record.files else INTERRUPTED)
         if self.asked:
             end_process("interrupted again, stopped at once")
         self.asked = True

@@ -84,6 +84,34 @@ def campaign_command(
     campaign.run(links, measured_table(csv, rows, units), given)
 
 
+@command("record")
+def record_command(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help="Folder of a ROS 2 bag.")],
+    seen: Annotated[
+        str,
+        typer.Option("--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured."),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table to write.")],
+    joints: Annotated[str, typer.Option("--joints", metavar="TOPIC", help="Joint states.")] = "/joint_states",
+    still: Annotated[float, typer.Option("--still", min=1e-9, help="Largest motion of a joint at a stop.")] = 1e-3,
+    shortest: Annotated[float, typer.Option("--shortest", min=0.01, help="Shortest stop in seconds.")] = 0.5,
+    offset: Annotated[
+        float | None,
+        typer.Option("--offset", help="Seconds to add to the times of --seen; by default estimated from all motions."),
+    ] = None,
+) -> None:
+    """Turn a ROS 2 bag into a table, one row for each stop.
+
+    A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
+    standard deviations of what was seen (std_x, ...), its time and the number of readings. The clocks of both may
+    differ. Needs the package rosbags.
+    """
+    check_outputs({"-o": output}, {})
+    from diffeo_calib.cli.commands import record  # noqa: PLC0415
+
+    record.run(bag, (joints, seen), output, record.StopLimits(joints=still, shortest=shortest), offset)
+
+
 @command("evaluate")
 def evaluate_command(
     model: options.ModelPath,

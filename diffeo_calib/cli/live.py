@@ -26,15 +26,13 @@ ID = "id"
 
 
 @dataclass(frozen=True)
-class Goal:
-    """How long a campaign goes on, and what it proposes.
+class Shown:
+    """What a campaign says, and how.
 
     Args:
-        error: expected error to reach, m; None for none. poses: number of the next poses. lines: whether everything is
-            said as JSON lines.
+        poses: number of the next poses. lines: whether everything is said as JSON lines.
     """
 
-    error: float | None
     poses: int
     lines: bool
 
@@ -54,7 +52,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    goal: Goal
+    shown: Shown
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
@@ -71,7 +69,7 @@ class Live:
 
     def say(self, text: str, entry: Entry) -> None:
         """Print a text, or an entry as a line of JSON."""
-        if self.goal.lines:
+        if self.shown.lines:
             sys.stdout.write(as_line(entry).decode())
             sys.stdout.flush()
         elif text:
@@ -109,8 +107,8 @@ class Live:
         """Judge lines, and say what became of them; after the last what comes next."""
         for left, line in zip(reversed(range(len(lines))), lines, strict=True):
             number = self._add(line)
-            self._say(self.answer(number) | ({} if left or self.reached() else self.state()))
-            if self.reached():
+            self._say(self.answer(number) | ({} if left or self.campaign.reached else self.state()))
+            if self.campaign.reached:
                 return
 
     def poll(self) -> bool:
@@ -119,7 +117,7 @@ class Live:
             return False
         self.journal.add(self._revised())
         self.late += self.revised
-        if not self.goal.lines:  # those who send rows as JSON lines get one answer for each
+        if not self.shown.lines:  # those who send rows as JSON lines get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
         return True
@@ -223,11 +221,13 @@ class Live:
         known, found, robot = self.campaign.expected_error, self.found, self.campaign.robot
         entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
         entry["expected_error_mm"] = None if known is None else 1e3 * known
-        if self.goal.error is not None:
-            entry |= {"more_rows": None if found is None else found.needed, "target_reached": self.reached()}
+        if self.campaign.goal is not None:
+            limit, more = self.campaign.error_limit, None if found is None else found.needed
+            entry["error_limit_mm"] = None if limit is None else 1e3 * limit
+            entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
-        poses = [] if found is None else columns.joints_from_si(found.q[: self.goal.poses]).tolist()
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.shown.poses]).tolist()
         return entry | {"next": [dict(zip(names, q, strict=True)) for q in poses]}
 
     @property
@@ -235,7 +235,7 @@ class Live:
         """The next poses, and the forecast."""
         now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
-            self._found = now, self.campaign.next(max(self.goal.poses, 1), self.goal.error)
+            self._found = now, self.campaign.next(max(self.shown.poses, 1))
         return self._found[1]
 
     @property
@@ -245,13 +245,8 @@ class Live:
         more, known = state.get("more_rows", ""), state["expected_error_mm"]
         needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
-        first = "no model yet" if known is None else f"{known:.4g} mm expected{needed}"
+        first = "no model yet" if known is None else f"{_error(self.campaign)}{needed}"
         return first, "; ".join(f"next: {pose}" for pose in poses)
-
-    def reached(self) -> bool:
-        """Whether the expected error is small enough."""
-        known, goal = self.campaign.expected_error, self.goal.error
-        return goal is not None and known is not None and known <= goal
 
     def lines_of(self, rows: Sequence[int]) -> list[bytes]:
         """The lines of some rows."""
@@ -270,6 +265,11 @@ class Live:
 
 
 def expected(campaign: Campaign) -> str:
-    """The expected error in words; empty without one."""
-    known = campaign.expected_error
-    return "" if known is None else f", {1e3 * known:.4g} mm expected"
+    """The expected error in words, after a comma; empty without one."""
+    return "" if campaign.expected_error is None else f", {_error(campaign)}"
+
+
+def _error(campaign: Campaign) -> str:
+    """The expected error in words."""
+    limit, known = campaign.error_limit, 1e3 * (campaign.expected_error or 0.0)
+    return f"{known:.4g} mm expected" + ("" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)")

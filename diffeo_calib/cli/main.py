@@ -1,4 +1,4 @@
-"""The command line: fit, campaign, evaluate, predict, correct, export, plan, recalibrate, compare, report, demo.
+"""The command line, and what its exit codes mean.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
 out of step with their joints (the errors are printed first), or a median error above a tenth of the robot's reach (no

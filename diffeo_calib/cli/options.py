@@ -281,7 +281,7 @@ class FitOptions:
 class LiveOptions:
     """How to follow a campaign."""
 
-    target: str | None = option("End when the expected error is at most this, with its unit: 0.15mm.", "LENGTH")
+    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
         "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
     )

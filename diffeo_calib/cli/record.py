@@ -46,6 +46,11 @@ class Record:
         """Add results, or replace those of the same name."""
         self._results |= results
 
+    @property
+    def files(self) -> list[str]:
+        """Files that are written."""
+        return [str(path) for path in self._results.get("files", {}).values()]
+
     def warn(self, text: str) -> None:
         """Add a warning."""
         self._warnings.append(text)

@@ -48,6 +48,9 @@ class RegionPrior:
 
 
 REGION_PRIOR = RegionPrior()
+OTHER_DATE = RegionPrior(scale_efolds=2.0)
+"""On another date a robot may have changed by any amount: variances of 1 to 50 times the old ones are usual, and a
+prior as narrow as that of a calibration's own scales takes a third of the factor from ten rows that ask for 50."""
 
 
 def region_scale(

@@ -104,11 +104,11 @@ def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
         thread.join()
 
 
-def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None, goal: float | None) -> dict[str, Any]:
+def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> dict[str, Any]:
     """What the page shows: lengths in mm, places in m in the robot's base.
 
     Args:
-        words: the expected error, and the next poses. found: these. goal: expected error to reach, m.
+        words: the expected error, and the next poses. found: these.
     """
     robot, count, known = campaign.robot, len(campaign), campaign.expected_error
     seen = [(one.row + 1, 1e3 * one.expected_error) for one in campaign.verdicts if one.expected_error is not None]
@@ -125,7 +125,7 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None, goa
         "error": None if known is None else 1e3 * known,
         "state": f"{len(campaign.accepted)} of {count} rows accepted; {words[0]}",
         "pose": words[1],
-        "goal": None if goal is None else 1e3 * goal,
+        "goal": None if campaign.goal is None else 1e3 * campaign.goal,
         "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
         "forecast": steps,
         "verdicts": verdicts,

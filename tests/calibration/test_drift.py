@@ -177,6 +177,7 @@ def test_columns_that_cannot_be() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
     form = TableFormat("mm", "deg", time="hour")
     write_measurements(tmp_path / "t.csv", drifting_rows(), form)

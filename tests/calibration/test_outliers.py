@@ -5,12 +5,10 @@ One wrong row and three markers show that the choice of scales is not disturbed;
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, ur10_measurements
+from product_bank import Case, simulated
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -219,37 +217,27 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
 # --- a real robot ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def ur10(ur10_folder: Path) -> Case:
-    """150 of the 442 training rows, the usual ones held out."""
-    robot, data = ur10_measurements(ur10_folder)
-    train, test = data.split(0.7, seed=0)
-    some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
-    some = dc.Measurements(some.q, some.points)
-    return Case(robot, some, test, dc.calibrate(robot, some))
+@pytest.mark.slow
+def test_a_clean_ur10(ur10_150: Case) -> None:
+    assert ur10_150.result.outliers == []
+    assert 1e3 * ur10_150.held_out()[2] < 0.18
 
 
 @pytest.mark.slow
-def test_a_clean_ur10(ur10: Case) -> None:
-    assert ur10.result.outliers == []
-    assert 1e3 * ur10.held_out()[2] < 0.18
-
-
-@pytest.mark.slow
-def test_one_row_of_a_ur10_wrong_by_50_mm(ur10: Case) -> None:
-    points = ur10.train.points.clone()
+def test_one_row_of_a_ur10_wrong_by_50_mm(ur10_150: Case) -> None:
+    points = ur10_150.train.points.clone()
     points[7] += aside(0.05, 7)
-    scales = ur10.result.selection.scales
-    result = dc.calibrate(ur10.robot, dc.Measurements(ur10.train.q, points), hyperparameters=scales)
+    scales = ur10_150.result.selection.scales
+    result = dc.calibrate(ur10_150.robot, dc.Measurements(ur10_150.train.q, points), hyperparameters=scales)
     assert list(flagged(result)) == [(7, None)]
-    assert held_out(result, ur10.test) < 1.05 * ur10.held_out()[2]
+    assert held_out(result, ur10_150.test) < 1.05 * ur10_150.held_out()[2]
 
 
 @pytest.mark.slow
-def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10: Case) -> None:
+def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: Case) -> None:
     """The tool turns by only 0.5 mrad in these rows: 0.02 rad in one of them outweigh all other rows."""
-    q = ur10.train.q.clone()
+    q = ur10_150.train.q.clone()
     q[9, 2] += 0.02
-    scales = ur10.result.selection.scales
-    result = dc.calibrate(ur10.robot, dc.Measurements(q, ur10.train.points), hyperparameters=scales)
-    assert held_out(result, ur10.test) < 1.1 * ur10.held_out()[2]
+    scales = ur10_150.result.selection.scales
+    result = dc.calibrate(ur10_150.robot, dc.Measurements(q, ur10_150.train.points), hyperparameters=scales)
+    assert held_out(result, ur10_150.test) < 1.1 * ur10_150.held_out()[2]

@@ -142,11 +142,6 @@ def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
     torch.testing.assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
 
 
-def test_a_moved_device_without_sessions_is_named(arm: SimulatedArm) -> None:
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"seems to (have moved|drift)"):
-        dc.calibrate(arm.nominal, campaign(arm, shuffled=False).with_sessions(None))
-
-
 def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
     data = campaign(arm, shuffled=False)
     with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 3"):

@@ -6,8 +6,6 @@ import http.client
 import io
 import json
 import os
-import random
-import signal
 import subprocess
 import sys
 import time
@@ -152,37 +150,6 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
     assert accepted[0] == accepted[1]
-
-
-@pytest.mark.slow
-def test_a_killed_campaign_loses_no_row(tmp_path: Path, lines: list[str]) -> None:
-    """kill -9 at random moments after a row has come by JSON lines; every row that the table has is judged once."""
-    names = lines[0].strip().split(",")
-    rows = [dict(zip(names, map(float, line.split(",")), strict=True)) for line in lines[1:]]
-    generator, sent, kills, table = random.Random(0), 0, 3, tmp_path / "run.csv"
-
-    def written() -> int:
-        return max(table.read_bytes().count(b"\n") - 1, 0) if table.exists() else 0
-
-    command = [sys.executable, "-c", PROGRAM, "campaign", "campaign.toml", "--stdin"]
-    for attempt in range(kills + 1):
-        process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert process.stdin is not None
-        for row in rows[sent:] if attempt == kills else rows[sent : sent + 7]:
-            process.stdin.write(json.dumps(row) + "\n")
-        process.stdin.flush()
-        if attempt == kills:
-            assert process.communicate(timeout=300)[0]
-            break
-        while written() == sent and process.poll() is None:
-            time.sleep(0.01)
-        time.sleep(generator.uniform(0, 0.3))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        sent = written()
-    journal = [json.loads(line) for line in (tmp_path / "run.csv.journal").read_text().splitlines()]
-    assert [one["line"] for one in journal if "line" in one] == list(range(2, ROWS + 2))
-    assert (tmp_path / "run.csv").read_text().count("\n") == ROWS + 1
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.campaign.certainty import limit_of
 from diffeo_calib.campaign.posterior import Posterior, Rows
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
@@ -254,3 +255,39 @@ def test_other_kinds_of_rows(name: str) -> None:
     found = campaign.next(2)
     assert found is not None
     assert found.expected[2] < found.expected[0]
+
+
+def test_the_limit_holds_95_percent_of_errors() -> None:
+    random = torch.Generator("cpu").manual_seed(0)
+    root = torch.randn(60, 20, generator=random, dtype=torch.float64)
+    errors = (root @ torch.randn(20, 4000, generator=random, dtype=torch.float64)).square().mean(0).sqrt()
+    S = root @ root.T
+    limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
+    assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
+    assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
+
+
+def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
+    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
+    arm = SimulatedArm(3)
+    places, (q, y) = arm.sample(10, seed=8), arm.measure(20, seed=7)
+    campaign = dc.Campaign(arm.nominal, candidates=places, target=places, goal=1e-6)
+    campaign.add(q[:19], y[:19])
+    assert campaign.error_limit is None
+    assert not campaign.reached
+    campaign.add(q[19], y[19])
+    known, limit, model = campaign.expected_error, campaign.error_limit, campaign._model
+    assert known is not None
+    assert limit is not None
+    assert model is not None
+    assert 1.1 < limit / known < 2
+    assert not campaign.reached
+    for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
+        campaign.goal = goal
+        assert campaign.reached == (needed == 0)
+        assert campaign._next_scales(model) == pytest.approx(factor * 20)
+        found = campaign.next(1)
+        assert found is not None
+        assert needed is None or found.needed == needed
+    with pytest.raises(InputError, match="goal"):
+        dc.Campaign(arm.nominal, goal=0.0)

@@ -102,7 +102,7 @@ def campaign() -> dc.Campaign:
 
 def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
     state = json.loads(
-        json.dumps(state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4), allow_nan=False)
+        json.dumps(state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1)), allow_nan=False)
     )
     assert state["state"] == "15 of 16 rows accepted; 0.5 mm expected"
     assert [one["line"] for one in state["verdicts"]] == list(range(15, 7, -1))
@@ -110,7 +110,7 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
     assert len(state["links"]) == 7
     empty = dc.Campaign(ARM.nominal)
     empty.add(torch.zeros(6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    assert state_of(empty, ("no model yet", ""), None, None)["error"] is None
+    assert state_of(empty, ("no model yet", ""), None)["error"] is None
 
 
 def opened(running: Any) -> Any:
@@ -124,7 +124,7 @@ def opened(running: Any) -> Any:
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
 def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, scheme: Any) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
-    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4)
+    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1))
     with playwright.sync_playwright() as running:
         browser = opened(running)
         seen = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
@@ -169,7 +169,7 @@ def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, sc
 def test_hours_of_rows_need_no_more_memory(page: Page, campaign: dc.Campaign) -> None:
     """Full states, one after the other: the second half leaves server and page as large as the first."""
     playwright = pytest.importorskip("playwright.sync_api")
-    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1), 1e-4)
+    state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1))
     state["curve"], state["done"] = [[row, 1 / (row + 1)] for row in range(500)], 500 * [[0.1, 0.2, 0.3]]
     sizes = []
     with playwright.sync_playwright() as running:

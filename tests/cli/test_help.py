@@ -69,6 +69,7 @@ OPTIONS = {
             "--accepted",
         ),
     ],
+    "record": ["BAG", "--seen", "-o", "--output", "--joints", "--still", "--shortest", "--offset"],
     "evaluate": [
         *(
             "MODEL",

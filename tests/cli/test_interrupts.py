@@ -21,6 +21,7 @@ from command_bank import (
 
 import diffeo_calib as dc
 from diffeo_calib.cli.console import Interrupts
+from diffeo_calib.cli.record import record
 
 
 def interrupted_calibrate(*_: Any, **__: Any) -> None:
@@ -86,6 +87,20 @@ def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypat
     assert interrupts.asked
     assert notes[0].startswith("interrupted: finishing with the best state so far")
     assert len(seen) == 4
+
+
+def test_ctrl_c_after_the_files_are_written_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[str] = []
+    monkeypatch.setattr("diffeo_calib.cli.console.end_process", ended.append)
+    before, interrupts = signal.getsignal(signal.SIGINT), Interrupts()
+    interrupts.install()
+    try:
+        record.add(files={"program": "corrected.csv"})
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        record.add(files={})
+    assert ended == ["interrupted; written: corrected.csv"]
 
 
 INTERRUPTIBLE = """

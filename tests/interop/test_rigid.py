@@ -9,7 +9,7 @@ import pytest
 import torch
 from export_bank import rigid_model, wrong
 from model_file_bank import Editor, refused, set_entry, set_tensor
-from product_bank import Case, ur10_measurements
+from product_bank import Case
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -175,12 +175,9 @@ def test_damaged_entries_are_refused(editor: Editor) -> None:
 
 
 @pytest.mark.slow
-def test_on_a_real_robot(ur10_folder: Path) -> None:
+def test_on_a_real_robot(ur10_150: Case) -> None:
     """Held-out rows of the UR10, 150 rows fitted: 0.40 mm, where the model's geometry left alone leaves 0.6."""
-    robot, data = ur10_measurements(ur10_folder)
-    train, test = data.split(0.7, seed=0)
-    rows = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[:150]
-    model = dc.calibrate(robot, train.rows(rows)).model
+    model, test = ur10_150.model, ur10_150.test
     rigid = rigid_kinematics(model)
     found, alone = (rms(geometry.points(test.q), test.points) for geometry in (rigid.geometry, model.geometry))
     assert found < 0.43e-3 < alone

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, usual_scales
+from product_bank import Case, simulated, usual_scales, with_usual_scales
 from scipy.stats import chi2
 
 import diffeo_calib as dc
@@ -107,7 +107,7 @@ def test_bands_of_transmission_errors_hold_the_truth() -> None:
     for seed in range(2):
         case_arm = dc.robots.simulated_arm.SimulatedArm(seed=seed)
         q, points = case_arm.measure(80, seed=seed)
-        model = dc.calibrate(case_arm.nominal, dc.Measurements(q, points)).model
+        model = with_usual_scales(case_arm.nominal, dc.Measurements(q, points)).model
         rows = FitRows(model)
         for joint, name in enumerate(model.robot.joint_names):
             values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), 40, dtype=torch.float64)

@@ -169,12 +169,9 @@ def compare(
         warn_about(found, outliers=not changes.found, excess=not changes.found)
         warn_of_moved_markers(found, marker)
     warn_of_scale(rows)
-    own = rows.posterior.diagonal().view(rows.y.shape) - rows.shifts.square().sum(-1)
-    deviations = (own + rows.noise.diagonal(dim1=1, dim2=2)).clamp(min=0).sqrt()
-    hidden = ~rows.noise_model.coordinates(rows.y)
     usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
-    kinds = (rows.placed_residual, *(one.masked_fill(hidden, nan) for one in (deviations, usual)))
-    return Comparison(found, changes, *map(rows.by_kind, kinds))
+    usual = usual.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
+    return Comparison(found, changes, *map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual)))
 
 
 def _usual_deviation(model: CalibratedKinematics) -> float:

@@ -31,7 +31,7 @@ from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
@@ -258,7 +258,7 @@ class NewRows:
         if self.observe is None and self.fitted.slopes is None:
             noise = noise * (self.new_noise.trace() / self._mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
-        return max(1.0, region_scale(squares, self.noise_model.freedom))
+        return max(1.0, region_scale(squares, self.noise_model.freedom, prior=OTHER_DATE))
 
     def _inverse(self) -> tuple[Tensor, Tensor]:
         """covariance^-1 (M m, M m) and its blocks (M, m, m)."""
@@ -274,13 +274,32 @@ class NewRows:
         error = noise @ mu
         return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
 
+    @cached_property
+    def after_placing(self) -> Tensor:
+        """(M R, M R) what becomes of errors once devices and markers are where the rows fit best.
+
+        They are weighed by the noise alone, as in a registration: weights by the covariance of the model would leave
+        centimetres in the rows where the model is uncertain by as much, although another place explains them.
+        """
+        flat = self.shifts.flatten(0, 1)
+        weighted = torch.linalg.solve(self.weighted_noise, self.shifts).flatten(0, 1)
+        eye = torch.eye(flat.shape[1], dtype=flat.dtype, device=flat.device)
+        gain = torch.linalg.solve(eye + flat.T @ weighted, weighted.T)
+        return torch.eye(len(flat), dtype=flat.dtype, device=flat.device) - flat @ gain
+
     @property
     def placed_residual(self) -> Tensor:
         """(M, R) residuals with devices and markers where the rows put them, m; NaN where hidden."""
-        flat = self.shifts.flatten(0, 1)
-        pull = torch.linalg.solve(self.covariance, self.residual.flatten())
-        left = self.residual - (flat @ (flat.T @ pull)).view(self.y.shape)
+        left = (self.after_placing @ self.residual.flatten()).view(self.y.shape)
         return left.masked_fill(~self.noise_model.coordinates(left), nan)
+
+    @property
+    def expected_residual(self) -> Tensor:
+        """(M, R) standard deviations of these that model and noise lead to expect, m; NaN where hidden."""
+        flat = self.shifts.flatten(0, 1)
+        total = Noise(self.noise).add_to(self.posterior - flat @ flat.T)
+        variances = ((self.after_placing @ total) * self.after_placing).sum(1).clamp(min=0.0)
+        return variances.sqrt().view(self.y.shape).masked_fill(~self.noise_model.coordinates(self.y), nan)
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""

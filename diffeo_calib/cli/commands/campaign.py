@@ -16,7 +16,7 @@ from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.commands.fit import RobotFile
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.live import Goal, Live, expected
+from diffeo_calib.cli.live import Live, Shown, expected
 from diffeo_calib.cli.options import LiveOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
@@ -40,11 +40,10 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     robot = links.read()
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
-    goal = Goal(None if limit is None else limit.value, given.next, given.json_lines)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
-        campaign = Campaign(robot, candidates=candidates)
-        live = Live(campaign, source, links.tips, journal, goal)
+        campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
+        live = Live(campaign, source, links.tips, journal, Shown(given.next, given.json_lines))
         live.resume()
         inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
@@ -67,13 +66,13 @@ def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -
         for news in _happening(live, given, inbox):
             step("campaign", 0, 1)
             if page is not None and news:
-                page.publish(state_of(live.campaign, live.words, live.found, live.goal.error))
-            if live.reached():
+                page.publish(state_of(live.campaign, live.words, live.found))
+            if live.campaign.reached:
                 break
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     live.campaign.wait()
-    return 0 if live.goal.error is None or live.reached() else EXIT_ABOVE
+    return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
 def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:

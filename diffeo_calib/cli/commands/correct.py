@@ -11,7 +11,7 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.options import Correction, Frame, StoredUnits
 from diffeo_calib.cli.record import record
@@ -85,7 +85,9 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
     how = {"frame": options.frame.value, "bound": bound, "path": rate is not None, "rate": rate}
-    found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
+    with progress_bar() as progress:
+        progress("commands", 0, 1)
+        found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     sheet.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
     record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})

@@ -10,7 +10,7 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import read_folder
-from diffeo_calib.cli.console import say
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.options import BoardImages
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
@@ -22,7 +22,8 @@ from diffeo_calib.measurements.table_format import TableFormat
 def run(folder: Path, joints: Path, given: BoardImages, output: Path) -> None:
     """Find the board, and write corners, camera and overview."""
     table = TableFormat(given.length.value, "rad", given.sep, given.decimal)
-    found = read_folder(folder, joints, Board.of(given.board), table.sep)
+    with progress_bar() as progress:
+        found = read_folder(folder, joints, Board.of(given.board), table.sep, progress)
     for one in found.images:
         if one.refused:
             say(f"{one.name}: {one.refused}: left out")

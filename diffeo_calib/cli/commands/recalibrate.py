@@ -10,7 +10,7 @@ import typer
 from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, progress_bar, say
+from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
@@ -41,9 +41,8 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)
         warn_outside_range(model, data.q)
-        watched = interrupts.watching(progress, err.print)
         named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
-        result = recalibrate(model, data, progress=watched, **named)
+        result = recalibrate(model, data, progress=progress, **named)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
         changes=changes_entry(result.changes),
@@ -65,8 +64,6 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
         say(line)
     say(result.fit.status)
     say(f"model: {output}")
-    if interrupts.asked:
-        raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 

@@ -36,7 +36,7 @@ from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
-from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
 
@@ -288,7 +288,7 @@ class Estimate:
         away = errors.nan_to_num(0.0)[..., None]
         squares = (away.mT @ torch.linalg.solve(own_blocks(covariance, markers), away))[..., 0, 0]
         squares = squares.masked_fill(errors.isnan().any(2), nan)
-        return max(1.0, region_scale(squares, 3, torch.full_like(squares, 1.0 / markers)))
+        return max(1.0, region_scale(squares, 3, torch.full_like(squares, 1.0 / markers), OTHER_DATE))
 
 
 def doubt(weights: Tensor) -> Tensor:

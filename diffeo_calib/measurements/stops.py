@@ -1,0 +1,142 @@
+"""Stops of a robot in two recordings that have clocks of their own: its joint values, and what a device saw.
+
+A recording stands still where no value changes by more than a tolerance within a window around it. The clocks differ by
+the shift with which both stand still and move at the same times most often. A stop lasts as long as both stand still,
+without half a window at either end; its row is the mean over it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffeo_calib.common.errors import MeasurementError
+
+Array = np.ndarray
+NOISE_FACTOR = 8.0
+"""Range of the noise within a window, in standard deviations, that is no motion."""
+STEP_S = 0.01
+"""Of the grid on which both recordings are compared."""
+FEWEST_CHANGES = 4
+"""Beginnings and ends of motions that tell how far the clocks differ."""
+
+
+@dataclass(frozen=True)
+class StopLimits:
+    """What counts as a stop.
+
+    Args:
+        joints: largest motion of a joint, rad or m. seen: of what is seen, m, unless its noise is larger.
+        window: within which they hold, s. shortest: stop, s. offset: largest difference of the clocks, s.
+    """
+
+    joints: float = 1e-3
+    seen: float = 1e-4
+    window: float = 0.2
+    shortest: float = 0.5
+    offset: float = 5.0
+
+
+LIMITS = StopLimits()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Values (T, d) at times (T,) that increase, s."""
+
+    times: Array
+    values: Array
+
+    def still(self, tolerance: float, window: float) -> Array:
+        """(T,) whether no value changes by more than the tolerance within a window around each time."""
+        first = np.searchsorted(self.times, self.times - 0.5 * window, "left")
+        last = np.searchsorted(self.times, self.times + 0.5 * window, "right")
+        found = [np.ptp(self.values[a:b], axis=0).max() for a, b in zip(first, last, strict=True)]
+        return np.array(found) <= tolerance
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a value by second differences, most of which belong to stops."""
+        return float(np.median(np.abs(np.diff(self.values, 2, axis=0)))) / (0.6745 * 6**0.5)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A stop: its time, s, means of both recordings, standard deviations (d,) of what was seen, and their number."""
+
+    time: float
+    joints: Array
+    seen: Array
+    deviations: Array
+    count: int
+
+
+def stops(
+    joints: Recording, seen: Recording, limits: StopLimits = LIMITS, offset: float | None = None
+) -> tuple[list[Stop], float]:
+    """Stops in two recordings.
+
+    Args:
+        seen: places in its first three columns, which tell whether it moves.
+        offset: seconds to add to the times of ``seen``; estimated by default.
+
+    Returns:
+        the stops in order, and the offset.
+
+    Raises:
+        MeasurementError: too few motions to tell the offset, or no stop.
+    """
+    places = Recording(seen.times, seen.values[:, :3])
+    rests = joints.still(limits.joints, limits.window)
+    tolerance = max(limits.seen, NOISE_FACTOR * places.noise)
+    resting = places.still(tolerance, limits.window)
+    if offset is None:
+        offset = _offset((joints.times, rests), (seen.times, resting), limits.offset)
+    times = seen.times + offset
+    found = []
+    for begin, end in _both(joints.times, rests, times, resting, limits):
+        here, there = (joints.times >= begin) & (joints.times <= end), (times >= begin) & (times <= end)
+        if here.any() and there.sum() > 1:
+            values = seen.values[there]
+            middle = 0.5 * (begin + end), joints.values[here].mean(0), values.mean(0)
+            found.append(Stop(*middle, values.std(0, ddof=1), len(values)))
+    if not found:
+        fix = "record for longer, or allow larger motions"
+        raise MeasurementError.of("stops", expected="some", got="none in which both recordings stand still", fix=fix)
+    return found, offset
+
+
+def _offset(joints: tuple[Array, Array], seen: tuple[Array, Array], largest: float) -> float:
+    """Seconds to add to the times of the second recording so that both rest together."""
+    begin = min(joints[0][0], seen[0][0]) - largest
+    grid = np.arange(begin, max(joints[0][-1], seen[0][-1]) + largest, STEP_S)
+    one, other = (_on(grid, *part) for part in (joints, seen))
+    if min(np.count_nonzero(np.diff(part)) for part in (one, other)) < FEWEST_CHANGES:
+        fix = "let the robot move between stops while both are recorded, or give the offset"
+        raise MeasurementError.of("the offset between the clocks", expected="several motions and stops", fix=fix)
+    most = round(largest / STEP_S)
+    shifts = np.arange(-most, most + 1)
+    scores = np.array([float((one * np.roll(other, shift)).sum()) for shift in shifts])
+    best = np.flatnonzero(scores >= scores.max() - 0.5)  # the middle of those that are as good
+    return float(STEP_S * shifts[best].mean())
+
+
+def _on(grid: Array, times: Array, still: Array) -> Array:
+    """1 where a recording rests, -1 where it moves, 0 outside of it."""
+    nearest = np.interp(grid, times, np.where(still, 1.0, -1.0), left=0.0, right=0.0)
+    return np.sign(nearest)
+
+
+def _both(
+    times: Array, rests: Array, other: Array, resting: Array, limits: StopLimits
+) -> Iterator[tuple[float, float]]:
+    """Begins and ends of intervals in which both rest, s."""
+    grid = np.arange(max(times[0], other[0]), min(times[-1], other[-1]), STEP_S)
+    both = (_on(grid, times, rests) > 0) & (_on(grid, other, resting) > 0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], both.astype(int), [0]])))
+    for first, last in edges.reshape(-1, 2):
+        begin, end = grid[first] + 0.5 * limits.window, grid[last - 1] - 0.5 * limits.window
+        if end - begin >= limits.shortest:
+            yield float(begin), float(end)
