@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,6 +23,8 @@ CAMERA = (0.06, 0.01, 0.04, 0.1, -0.2, 0.3)
 """Place of the camera in the flange, m, and its rotation vector, rad."""
 FIXED_CAMERA = (1.0, 0.3, 0.7), (0.5, 0.0, 0.35)
 """Place of a fixed camera in the arm's base, and where it looks, m."""
+SECOND_CAMERA = (0.5, -0.75, 0.6), (0.5, 0.0, 0.35)
+"""The same of another camera that sees the same board."""
 BOARD_ON_FLANGE = 0.0, 0.02, 0.05
 """Place of a board on the flange, m, that looks away from it."""
 NEAR, FAR, VIEW = 0.25, 0.6, 0.85
@@ -31,6 +33,8 @@ WIDTH, HEIGHT, SQUARE, CORNERS = 1280, 960, 0.03, (7, 5)
 """Of the images, pixels; side of a square of the board, m, and its inner corners along x and y."""
 LENS = 1200.0, 1195.0, 650.0, 470.0, -0.15, 0.08, 1e-3, -5e-4, 0.0
 """True lens of the camera, see diffeo_calib.cameras.board."""
+SECOND_LENS = 1000.0, 1003.0, 630.0, 490.0, -0.1, 0.04, -5e-4, 8e-4, 0.0
+"""That of the second camera."""
 PRINT = 1e-4, 1e-4, 1e-3, 0.0, -5e-4
 """True errors of the printed board, see diffeo_calib.cameras.board."""
 BOARD_PRIOR = BoardPrior(scale=2e-4)
@@ -59,11 +63,15 @@ class CameraArm:
 
     def images(self, noise_px: float, *, on_tool: bool = True, seed: int = 7) -> dc.Measurements:
         """Corners with drawn errors in the images that show enough of them; not ``on_tool``: seen by a fixed camera."""
+        q, corners = self.shown(noise_px, seed)
+        known = {"board": BOARD_PRIOR, "camera_on_tool": on_tool}
+        return dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), self.arm.nominal.joint_names, **known)
+
+    def shown(self, noise_px: float, seed: int = 7) -> tuple[Tensor, Tensor]:
+        """Configurations, and corners with drawn errors, of the images that show enough of them."""
         corners = seen_corners(self.boards, noise_px, seed, self.camera)
         shown = (~corners[..., 3].isnan()).sum(1) >= FEWEST_SEEN
-        known = {"board": BOARD_PRIOR, "camera_on_tool": on_tool}
-        names = self.arm.nominal.joint_names
-        return dc.Measurements.from_images(self.q[shown], corners[shown], (WIDTH, HEIGHT), names, **known)
+        return self.q[shown], corners[shown]
 
     def error(self, kinematics: dc.CalibratedKinematics, q: Tensor) -> float:
         """Root mean square distance to the truth of the three points of the camera's pose, m."""
@@ -77,10 +85,10 @@ def flat_board() -> Tensor:
     return torch.stack([x.flatten(), y.flatten(), torch.zeros_like(x).flatten()], 1)
 
 
-def true_camera(print_seed: int | None = None) -> Camera:
+def true_camera(print_seed: int | None = None, lens: Sequence[float] = LENS) -> Camera:
     """Lens and board as they are; with a seed the errors of the print are drawn from their prior."""
     half_size = SQUARE * (max(CORNERS) - 1) / 2
-    unknowns = torch.tensor([*LENS, *PRINT], dtype=torch.float64, device=HOST)
+    unknowns = torch.tensor([*lens, *PRINT], dtype=torch.float64, device=HOST)
     if print_seed is not None:
         draw = torch.randn(len(PRINT), dtype=torch.float64, device=HOST, generator=seeded(print_seed))
         unknowns[len(LENS) :] = draw * draw.new_tensor(BOARD_PRIOR.deviations(half_size))
@@ -109,10 +117,10 @@ def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) -> Camer
     return CameraArm(arm, *seen_boards, true_camera(print_seed))
 
 
-def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) -> CameraArm:
+def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *, second: bool = False) -> CameraArm:
     """An arm with the board on its flange, in random configurations in which a fixed camera sees it; print as there."""
-    arm = SimulatedArm(seed=seed, markers=3)
-    place, aim = (torch.tensor(xyz, dtype=torch.float64, device=HOST) for xyz in FIXED_CAMERA)
+    arm, where = SimulatedArm(seed=seed, markers=3), SECOND_CAMERA if second else FIXED_CAMERA
+    place, aim = (torch.tensor(xyz, dtype=torch.float64, device=HOST) for xyz in where)
     z = (aim - place) / (aim - place).norm()
     x = torch.linalg.cross(z, z.new_tensor([0.0, 0.0, 1.0]))
     x = x / x.norm()
@@ -123,7 +131,18 @@ def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) ->
     on_flange[:3, 3] = torch.tensor(BOARD_ON_FLANGE, dtype=torch.float64, device=HOST)
     arm.truth = replace(arm.truth, base=base, tool=mark_points(on_flange[None], LEVER)[0])
     seen_boards = _seen(arm, rows, seed, lambda points: poses_from_marks(points, LEVER))
-    return CameraArm(arm, *seen_boards, true_camera(print_seed))
+    return CameraArm(arm, *seen_boards, true_camera(print_seed, SECOND_LENS if second else LENS))
+
+
+def images_of_both(arms: Sequence[CameraArm], rows: Sequence[int], noise_px: float, seed: int = 7) -> dc.Measurements:
+    """The first images of two cameras, "left" and "right", that stand and see the board on the same arm, in turn."""
+    names = arms[0].arm.nominal.joint_names
+    q, corners = zip(*(arm.shown(noise_px, seed + k) for k, arm in enumerate(arms)), strict=True)
+    order = torch.cat([torch.arange(count, device=HOST) for count in rows]).argsort(stable=True)
+    q, corners = (torch.cat([own[:n] for own, n in zip(each, rows, strict=True)])[order] for each in (q, corners))
+    cameras = [name for name, count in zip(("left", "right"), rows, strict=True) for _ in range(count)]
+    known = {"board": BOARD_PRIOR, "camera_on_tool": False, "seen_by": [cameras[k] for k in order.tolist()]}
+    return dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), names, **known)
 
 
 def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

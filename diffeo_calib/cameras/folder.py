@@ -1,4 +1,4 @@
-"""A folder of images of a board, and a table of the joint values of each: to a table of corners."""
+"""Folders of images of a board, one of each camera, and a table of joint values: to a table of corners."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import base64
 import csv
 import html
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from diffeo_calib.cameras.images import Camera, Images, first_guess
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 
-IMAGE = "image"
+IMAGE, CAMERA = "image", "camera"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 THUMBNAIL = 320
 """Width of an image in the overview, pixels."""
@@ -43,10 +43,12 @@ class Folder:
     """What the images of a folder show.
 
     Args:
-        board: that was looked for. header: names of the joint columns. images: in the order of the table.
+        name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
+        images: in the order of the table.
         size: width and height, pixels.
     """
 
+    name: str
     board: Board
     header: list[str]
     images: list[Seen]
@@ -77,52 +79,78 @@ class Folder:
             corners[row, : len(whole)] = torch.from_numpy(whole)
         return first_guess(Images(corners[..., :3], corners[..., 3:], *self.size), board)
 
-    def page(self) -> str:
-        """An overview in HTML: every image with its corners, or why it is refused."""
-        cells = "".join(
-            f'<figure><img src="data:image/jpeg;base64,{one.thumbnail}"><figcaption>{html.escape(one.name)}: '
-            f"{html.escape(one.refused) or f'{len(one.numbers)} corners'}</figcaption></figure>"
-            for one in self.images
-        )
-        style = "figure{display:inline-block;margin:6px;width:320px;vertical-align:top;font:13px sans-serif}"
-        head = f"{len(self.used)} of {len(self.images)} images show {html.escape(self.board.text)}"
-        return f"<!doctype html><meta charset=utf-8><title>{head}</title><style>{style}</style><h1>{head}</h1>{cells}"
+
+def page(folders: Sequence[Folder]) -> str:
+    """An overview in HTML: every image with its corners, or why it is refused."""
+    cells = "".join(
+        f'<figure><img src="data:image/jpeg;base64,{one.thumbnail}"><figcaption>'
+        f"{html.escape(one.name if len(folders) == 1 else f'{folder.name}/{one.name}')}: "
+        f"{html.escape(one.refused) or f'{len(one.numbers)} corners'}</figcaption></figure>"
+        for folder in folders
+        for one in folder.images
+    )
+    style = "figure{display:inline-block;margin:6px;width:320px;vertical-align:top;font:13px sans-serif}"
+    used, whole = (sum(map(len, each)) for each in zip(*((own.used, own.images) for own in folders), strict=True))
+    head = f"{used} of {whole} images show {html.escape(folders[0].board.text)}"
+    return f"<!doctype html><meta charset=utf-8><title>{head}</title><style>{style}</style><h1>{head}</h1>{cells}"
 
 
-def read_folder(
-    folder: Path, joints: Path, board: Board, sep: str = ",", progress: Progress = lambda *_: None
-) -> Folder:
+def read_folders(
+    folders: Sequence[Path], joints: Path, board: Board, sep: str = ",", progress: Progress = lambda *_: None
+) -> list[Folder]:
     """Find a board in the images of a table of joint values.
 
     Args:
-        folder: of the images. joints: a table with a header; its column `image` names the file of each row, without
-            one the rows are those of the files in alphabetical order. board: to look for. sep: between cells.
-        progress: called as ``progress(task, done, total)``.
+        folders: of the images, one of each camera.
+        joints: a table with a header; its column `image` names the file of each row, in every folder that has one;
+            without this column the rows are those of the files of each folder in alphabetical order.
+        board: to look for. sep: between cells. progress: called as ``progress(task, done, total)``.
 
     Raises:
-        MeasurementError: rows and images that do not belong to one another, or no image that shows the board.
+        MeasurementError: rows and images that do not belong to one another, or a folder without an image that shows the
+            board; folders of the same name.
     """
-    header, rows, names = _table(folder, joints, sep)
-    read = [_grey(folder / name) for name in names]
+    names = [folder.resolve().name for folder in folders]
+    if len(set(names)) < len(names):
+        fix = "name the folder of each camera after it"
+        raise MeasurementError.of("the folders of images", expected="different names", got=few(names), fix=fix)
+    header, rows = _table(joints, sep)
+    if CAMERA in header and len(folders) > 1:
+        fix = "leave it out: the folders name the cameras"
+        raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
+    header, rows, files = _files(folders, joints, header, rows)
+    each = zip(folders, names, files, strict=True)
+    found = []
+    for folder, name, own in each:
+        whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
+        found.append(_folder(folder, Folder(name, board, header, [], (0, 0)), whole, progress))
+    return found
+
+
+def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]], progress: Progress) -> Folder:
+    """Find the board in the files of one folder, with the cells of their rows."""
+    board = empty.board
+    read = [_grey(folder / file) for file, _ in known]
     sizes = Counter(image.shape for image in read if image is not None)
     if not sizes:
         raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
     usual = sizes.most_common(1)[0][0]
     images = []
-    for name, cells, image in zip(names, rows, read, strict=True):
-        progress("images", len(images), len(names))
-        images.append(_seen(name, cells, image, board, usual))
-    found = Folder(board, header, images, (usual[1], usual[0]))
+    for own, image in zip(known, read, strict=True):
+        progress("images", len(images), len(known))
+        images.append(_seen(*own, image, board, usual))
+    found = replace(empty, images=images, size=(usual[1], usual[0]))
     if not found.used:
         reasons = few([f"{one.name}: {one.refused}" for one in images])
-        likely = next((name for image in read[:3] if image is not None and (name := other_dictionary(image))), None)
+        likely = next((word for image in read[:3] if image is not None and (word := other_dictionary(image))), None)
         fix = "check the board and the images" if likely is None else f"most markers are of {likely}: check --board"
-        raise MeasurementError.of(f"images that show {board.text}", expected="some", got=reasons, fix=fix)
+        what = f"images of '{folder}' that show {board.text}"
+        raise MeasurementError.of(what, expected="some", got=reasons, fix=fix)
     return found
 
 
-def _table(folder: Path, joints: Path, sep: str) -> tuple[list[str], list[list[str]], list[str]]:
-    """Header and cells without the column of images, and the names of the files."""
+def _table(joints: Path, sep: str) -> tuple[list[str], list[list[str]]]:
+    """Header and cells."""
     try:
         with joints.open(newline="", encoding="utf-8-sig") as file:
             lines = [line for line in csv.reader(file, delimiter=sep) if any(cell.strip() for cell in line)]
@@ -130,20 +158,32 @@ def _table(folder: Path, joints: Path, sep: str) -> tuple[list[str], list[list[s
         raise MeasurementError.of(f"file '{joints}'", expected="a CSV file", got=str(error)) from None
     if len(lines) < 2 or len({len(line) for line in lines}) > 1:
         raise MeasurementError.of(f"file '{joints}'", expected="a header and rows with as many cells")
-    header, rows = [cell.strip() for cell in lines[0]], lines[1:]
+    return [cell.strip() for cell in lines[0]], lines[1:]
+
+
+def _files(
+    folders: Sequence[Path], joints: Path, header: list[str], rows: list[list[str]]
+) -> tuple[list[str], list[list[str]], list[list[str | None]]]:
+    """Header and cells without the column of images, and the file of each row in every folder."""
     if IMAGE in header:
         place = header.index(IMAGE)
         names = [row[place].strip() for row in rows]
-        missing = [name for name in names if not (folder / name).is_file()]
+        files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
+        missing = [name for name, *own in zip(names, *files, strict=True) if not any(own)]
         if missing:
-            raise MeasurementError.of(f"images in '{folder}'", expected="those of the table", got=f"no {few(missing)}")
-        header, rows = [h for k, h in enumerate(header) if k != place], [row[:place] + row[place + 1 :] for row in rows]
-        return header, rows, names
-    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-    if len(names) != len(rows):
-        got, fix = f"{len(names)} images, {len(rows)} rows", "add a column `image` with the name of each row's file"
-        raise MeasurementError.of(f"'{folder}' and '{joints}'", expected="an image for each row", got=got, fix=fix)
-    return header, rows, names
+            where = " or ".join(f"'{folder}'" for folder in folders)
+            raise MeasurementError.of(f"images in {where}", expected="those of the table", got=f"no {few(missing)}")
+        rows = [row[:place] + row[place + 1 :] for row in rows]
+        return [name for k, name in enumerate(header) if k != place], rows, files
+    found: list[list[str | None]] = []
+    for folder in folders:
+        own = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if len(own) != len(rows):
+            got, fix = f"{len(own)} images, {len(rows)} rows", "add a column `image` with the name of each row's file"
+            what = f"'{folder}' and '{joints}'"
+            raise MeasurementError.of(what, expected="an image for each row", got=got, fix=fix)
+        found.append([*own])
+    return header, rows, found
 
 
 def _grey(path: Path) -> np.ndarray | None:

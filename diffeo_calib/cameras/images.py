@@ -9,13 +9,15 @@ the minimum over all T_i and s leaves every pose with an error of its own and on
 
     T^_i = T_i + A_i^-1 B_i (s - s^) + N(0, A_i^-1),    s - s^ ~ N(0, K^-1).
 
-To first order this is all that the pixels say: 6 numbers per image instead of two per corner.
+To first order this is all that the pixels say: 6 numbers per image instead of two per corner. Of several cameras that
+see the same board, s holds the lens of each and the one board: the print's scale is the same error in all images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -110,15 +112,19 @@ class Camera:
         return found | {name: {"value": value, "std": std} for name, value, std in known}
 
     def sentences(self) -> Iterator[str]:
-        """Lens and board with standard deviations."""
+        """The lens with standard deviations."""
         value, std = self.unknowns.tolist(), self.deviations.tolist()
         own = [f"{name} {value[k]:.2f} +- {std[k]:.2f}" for k, name in enumerate(LENS[:4])]
         yield f"camera: {', '.join(own)} px, corners to {self.noise:.3f} px"
         own = [f"{name} {value[k]:.5f} +- {std[k]:.5f}" for k, name in enumerate(LENS[4:], 4)]
         yield f"lens distortion: {', '.join(own)}"
+
+    def board_sentence(self) -> str:
+        """The board with standard deviations."""
+        value, std = self.unknowns.tolist(), self.deviations.tolist()
         k, size = len(LENS), 1e3 * self.half_size
         bends = ", ".join(f"{size * value[k + 2 + i]:.2f} +- {size * std[k + 2 + i]:.2f}" for i in range(3))
-        yield (
+        return (
             f"board: scale {1e6 * value[k]:+.0f} +- {1e6 * std[k]:.0f} ppm, x against y {2e6 * value[k + 1]:+.0f} +- "
             f"{2e6 * std[k + 1]:.0f} ppm, bent {bends} mm; lengths are the board's"
         )
@@ -132,7 +138,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """What N images tell.
+    """What N images of one camera tell.
 
     Args:
         camera: lens and board.
@@ -150,35 +156,71 @@ class Sights:
 
 
 def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | None = None) -> Sights:
-    """Poses of a board, and lens and board, from images.
+    """Poses of a board, and lens and board, from images of one camera; see :func:`sighted_by_several`."""
+    return sighted_by_several([images], [camera], board)[0]
+
+
+def sighted_by_several(
+    images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior | None = None
+) -> list[Sights]:
+    """Poses of one board, lenses, and the board, from images of several cameras.
 
     Args:
-        images: of one camera. camera: what is known of lens and board before; nothing by default, and of the board
-            nothing if its size there is 0. board: prior of a board of which nothing is known.
+        images: of each camera. cameras: what is known of the lens and board of each before; None if nothing is, and of
+            the board nothing if its size there is 0. The board is that of the first camera that knows one.
+        board: prior of a board of which nothing is known.
+
+    Returns:
+        one for each camera; the c errors, of all lenses and the board, are the same in all of them.
 
     Raises:
         MeasurementError: an image with too few corners, or corners on a line; corners that are no image of the board.
     """
-    _check(images)
-    board = board or BoardPrior()
-    known = first_guess(images, board) if camera is None else camera
-    known = known if known.half_size else _with_board(known, images.half_size, board)
-    poses = first_poses(images, known)
-    state = _State(images, known, poses, torch.zeros_like(known.root[0]))
-    weights = _weights(state, state.errors().norm(dim=-1).nanmedian() / 1.2)
+    for one in images:
+        _check(one)
+    known = _known(images, cameras, board or BoardPrior())
+    v = torch.zeros_like(known[0].root[0])
+    states = [_State(*own, first_poses(*own), v) for own in zip(images, known, strict=True)]
+    weights = [_weights(state, state.errors().norm(dim=-1).nanmedian() / 1.2) for state in states]
     for _ in range(ROUNDS):
-        state = _minimum(state, weights)
-        before, weights = weights, _weights(state)
-        if float((weights / before - 1).abs().nan_to_num(0.0).max()) < 1e-3:
+        states = _minimum(states, weights)
+        before, weights = weights, [_weights(state) for state in states]
+        changes = ((new / old - 1).abs().nan_to_num(0.0).max() for new, old in zip(weights, before, strict=True))
+        if max(map(float, changes)) < 1e-3:
             break
-    return _result(_minimum(state, weights), weights)
+    return _result(_minimum(states, weights), weights)
 
 
-def first_guess(images: Images, board: BoardPrior) -> Camera:
+def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior) -> list[Camera]:
+    """What is known of all lenses and the one board, with the same columns of errors in all roots.
+
+    The board's errors are counted once: they are those of the first camera that knows it, the other ones add lenses.
+    """
+    size = max(one.half_size for one in images)
+    known = [first_guess(one, board, size) if own is None else own for one, own in zip(images, cameras, strict=True)]
+    first = next((k for k, own in enumerate(cameras) if own is not None and own.half_size), 0)
+    whole = known[first] if known[first].half_size else _with_board(known[first], size, board)
+    nothing = torch.zeros_like(whole.root[: len(LENS)])
+    lenses = [nothing[:, :0] if k == first else _lens_root(own) for k, own in enumerate(known)]
+    found = []
+    for k, (own, others) in enumerate(zip(known, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
+        lens = torch.cat([whole.root[: len(LENS)] if k == first else nothing, others], 1)
+        root = torch.cat([lens, torch.nn.functional.pad(whole.root[len(LENS) :], (0, others.shape[1]))])
+        found.append(replace(own, half_size=whole.half_size, unknowns=torch.cat([own.lens, whole.board]), root=root))
+    return found
+
+
+def _lens_root(camera: Camera) -> Tensor:
+    """(9, c) root of the covariance of the lens alone."""
+    return torch.linalg.qr(camera.root[: len(LENS)].mT).R.mT
+
+
+def first_guess(images: Images, board: BoardPrior, half_size: float | None = None) -> Camera:
     """A lens without distortion from homographies, with its principal point in the middle of the image.
 
     With H = (h1 h2 h3) of an image in pixels from there, h1^T w h2 = 0 and h1^T w h1 = h2^T w h2 for
-    w = diag(1/f^2, 1/f^2, 1). Source: Z. Zhang, "A flexible new technique for camera calibration", 2000.
+    w = diag(1/f^2, 1/f^2, 1). Half of the board's size, m, is what the images show of it, by default.
+    Source: Z. Zhang, "A flexible new technique for camera calibration", 2000.
     """
     H = homographies(images)
     a, b = H[..., 0], H[..., 1]
@@ -191,8 +233,9 @@ def first_guess(images: Images, board: BoardPrior) -> Camera:
     middle = [(images.width - 1) / 2, (images.height - 1) / 2]
     unknowns = H.new_tensor([focal, focal, *middle, *[0.0] * 10])
     lens = [FOCAL_SHARE * focal] * 2 + [CENTRE_SHARE * images.width] * 2 + list(DISTORTIONS)
-    root = torch.diag(H.new_tensor([*lens, *board.deviations(images.half_size)]))
-    return Camera(images.width, images.height, images.half_size, unknowns, root)
+    size = half_size or images.half_size
+    root = torch.diag(H.new_tensor([*lens, *board.deviations(size)]))
+    return Camera(images.width, images.height, size, unknowns, root)
 
 
 def _with_board(camera: Camera, half_size: float, board: BoardPrior) -> Camera:
@@ -277,43 +320,65 @@ class _State:
         return replace(self, poses=transforms(R, self.poses[:, :3, 3] + steps[:, :3]), v=v)
 
     def cost(self, weights: Tensor) -> float:
-        """Weighted squares of all errors, and of v."""
-        return float((self.errors() * weights[..., None]).nan_to_num(0.0).square().sum() + self.v.square().sum())
+        """Weighted squares of all errors."""
+        return float((self.errors() * weights[..., None]).nan_to_num(0.0).square().sum())
 
 
-def _normal(state: _State, weights: Tensor, damping: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """A^-1 (N, 6, 6), A^-1 B (N, 6, c), K (c, c), and gradients by poses (N, 6) and by v after elimination (c,)."""
-    by_pose, by_v = ((own * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for own in state.slopes())
-    errors = (state.errors() * weights[..., None]).nan_to_num(0.0).flatten(1)[..., None]
-    A, B = by_pose.mT @ by_pose, by_pose.mT @ by_v
-    A = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
-    size = A.diagonal(dim1=1, dim2=2).rsqrt()
-    inverse = size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
-    push, effect = by_pose.mT @ errors, inverse @ B
-    K = _eye(len(state.v), A) + (by_v.mT @ by_v - B.mT @ effect).sum(0)
-    along = (by_v.mT @ errors - effect.mT @ push).sum(0)[:, 0] - state.v
-    return inverse, effect, K, push[..., 0], along
+class _Normal(NamedTuple):
+    """A^-1 (N, 6, 6), A^-1 B (N, 6, c), K - 1 (c, c), and gradients by poses (N, 6) and by v after elimination (c,)."""
+
+    inverse: Tensor
+    effect: Tensor
+    known: Tensor
+    push: Tensor
+    along: Tensor
+
+    @classmethod
+    def of(cls, state: _State, weights: Tensor, damping: float = 0.0) -> _Normal:
+        """The normal equations of one camera's images."""
+        by_pose, by_v = ((own * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for own in state.slopes())
+        errors = (state.errors() * weights[..., None]).nan_to_num(0.0).flatten(1)[..., None]
+        A, B = by_pose.mT @ by_pose, by_pose.mT @ by_v
+        A = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
+        size = A.diagonal(dim1=1, dim2=2).rsqrt()
+        inverse = size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
+        push, effect = by_pose.mT @ errors, inverse @ B
+        known = (by_v.mT @ by_v - B.mT @ effect).sum(0)
+        along = (by_v.mT @ errors - effect.mT @ push).sum(0)[:, 0]
+        return cls(inverse, effect, known, push[..., 0], along)
 
 
-def _minimum(state: _State, weights: Tensor) -> _State:
+def _together(parts: Sequence[_Normal]) -> Tensor:
+    """K (c, c) of all cameras."""
+    return _eye(len(parts[0].along), parts[0].known) + sum(own.known for own in parts)
+
+
+def _cost(states: Sequence[_State], weights: Sequence[Tensor]) -> float:
+    """Weighted squares of all errors, and of v."""
+    own = sum(state.cost(each) for state, each in zip(states, weights, strict=True))
+    return own + float(states[0].v.square().sum())
+
+
+def _minimum(states: Sequence[_State], weights: Sequence[Tensor]) -> list[_State]:
     """Levenberg and Marquardt's method with the poses eliminated."""
-    damping, cost = 1e-6, state.cost(weights)
+    damping, cost, states = 1e-6, _cost(states, weights), list(states)
     for _ in range(STEPS):
-        inverse, effect, K, push, along = _normal(state, weights, damping)
-        dv = torch.linalg.solve(K + damping * torch.diag(K.diagonal()), along)
-        steps = (inverse @ push[..., None])[..., 0] - effect @ dv
-        trial = state.moved(steps, state.v + dv)
-        reached = trial.cost(weights)
+        parts = [_Normal.of(state, own, damping) for state, own in zip(states, weights, strict=True)]
+        K, v = _together(parts), states[0].v
+        dv = torch.linalg.solve(K + damping * torch.diag(K.diagonal()), sum(own.along for own in parts) - v)
+        steps = [(own.inverse @ own.push[..., None])[..., 0] - own.effect @ dv for own in parts]
+        trial = [state.moved(step, v + dv) for state, step in zip(states, steps, strict=True)]
+        reached = _cost(trial, weights)
         if reached <= cost:
             done = cost - reached < CONVERGED * cost
-            state, cost, damping = trial, reached, max(damping / 10, 1e-12)
+            states, cost, damping = trial, reached, max(damping / 10, 1e-12)
             if done:
                 break
         elif damping > DAMPED:
             break
         else:
             damping = max(10 * damping, 1e-6)
-    return state
+    return states
 
 
 def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
@@ -330,14 +395,17 @@ def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
     return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
 
 
-def _result(state: _State, weights: Tensor) -> Sights:
-    inverse, effect, K, _, _ = _normal(state, weights)
-    root = torch.linalg.inv(torch.linalg.cholesky(K)).mT  # root root^T = K^-1
-    squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
-    noise = float((2 * seen.sum() / weights.square().sum() / 2).sqrt())
-    camera = replace(state.camera, root=state.known.root @ root, noise=noise)
-    rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
-    return Sights(camera, state.poses, inverse, effect @ root, rms)
+def _result(states: Sequence[_State], weights: Sequence[Tensor]) -> list[Sights]:
+    parts = [_Normal.of(state, own) for state, own in zip(states, weights, strict=True)]
+    root = torch.linalg.inv(torch.linalg.cholesky(_together(parts))).mT  # root root^T = K^-1
+    found = []
+    for state, own, part in zip(states, weights, parts, strict=True):
+        squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
+        noise = float((2 * seen.sum() / own.square().sum() / 2).sqrt())
+        camera = replace(state.camera, root=state.known.root @ root, noise=noise)
+        rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
+        found.append(Sights(camera, state.poses, part.inverse, part.effect @ root, rms))
+    return found
 
 
 def _check(images: Images) -> None:

@@ -159,7 +159,9 @@ def init_command(
 
 @command("images")
 def images_command(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the images.")],
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER", help="Folder of the images, or one of each camera.")
+    ],
     joints: Annotated[
         Path,
         typer.Argument(
@@ -173,12 +175,14 @@ def images_command(
     """Find a printed board in a folder of images.
 
     Writes a line for each corner, and beside the table a file .yaml of the camera, for `fit --reading corners=FILE`.
-    Images that do not show the board are named with the reason and left out.
+    Several fixed cameras that see the same board: a folder and a file for each, named after it. Images that do not show
+    the board are named with the reason and left out.
     """
-    check_outputs({"-o": output, "--overview": given.overview}, {"FOLDER": folder, "JOINTS": joints})
+    inputs = {"JOINTS": joints} | {f"FOLDER {folder}": folder for folder in folders}
+    check_outputs({"-o": output, "--overview": given.overview}, inputs)
     from diffeo_calib.cli.commands import images  # noqa: PLC0415
 
-    images.run(folder, joints, given, output)
+    images.run(folders, joints, given, output)
 
 
 @command("predict")

@@ -32,11 +32,11 @@ from diffeo_calib.cli.guesses import (
     guess_sockets,
 )
 from diffeo_calib.cli.options import CORNERS, Rows
-from diffeo_calib.cli.tables import image_columns, reading_columns
+from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import number, read_cells
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.poses import numbers_of
@@ -99,7 +99,8 @@ class RowColumns:
         if self.readings:
             why = "by names; `displacement` is a distance with an unknown zero"
             why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels" * self.lens_missing
-            why += "; width and height of the images are the least usual size that holds all corners" * self.of_boards
+            sizes = self.of_boards and not self.readings[0].endswith(".yaml")
+            why += "; width and height of the images are the least usual size that holds all corners" * sizes
             yield "reading", self.readings[0] if len(self.readings) == 1 else self.readings, why
         if self.session is not None:
             why = "by its name: the device, or its set-up, of every row"
@@ -139,12 +140,22 @@ def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool
     """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
     header, rows = read_cells(csv, sheet.sep)
     if alone and {IMAGE, *POINT, *PIXEL} <= set(header):
-        return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
+        return _corners_in(csv, sheet)
     found = guess_readings(columns)
     if alone and len(found) == 1:
         return list(found)
     empty = {name for k, name in enumerate(header) if any(not cells[k].strip() for _, cells in rows)}
     return [text for text, own in found.items() if set(own) <= empty]
+
+
+def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
+    """The files of the cameras that `images` has written beside the table, else the size of the images."""
+    header, rows = read_cells(csv, sheet.sep)
+    names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
+    files = [f"{name}.yaml" for name in names]
+    if len(files) > 1 and all((csv.parent / file).is_file() for file in files):
+        return [f"{CORNERS}{csv.parent / file}" for file in files]
+    return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
 
 
 def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> tuple[int, int]:
@@ -221,14 +232,10 @@ class Source:
 
     def _columns(self, table: TableFormat) -> TableColumns:
         options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
-        texts = [text.replace(LENS, SOME_LENS) for text in self.rows.readings]
-        readings = [
-            image_columns(text, options) if text.startswith(CORNERS) else reading_columns(text, options.session)
-            for text in texts
-        ]
+        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
         sockets = SocketColumns(self.sockets) if self.sockets else None
         session = self.rows.session if self.markers else None
-        return TableColumns(self.joints, self.markers or None, sockets, tuple(readings), session, self.robot.kinds)
+        return TableColumns(self.joints, self.markers or None, sockets, readings, session, self.robot.kinds)
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.

@@ -22,7 +22,7 @@ from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
 from diffeo_calib.measurements.csv.images import ImageColumns, image_size
@@ -89,10 +89,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     """
     check_place(rows)
     table = with_rows(table_format(units), rows)
-    readings = tuple(
-        image_columns(text, rows) if text.startswith(CORNERS) else reading_columns(text, rows.session)
-        for text in rows.reading or ()
-    )
+    readings = readings_columns(rows.reading or (), rows)
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     return MeasuredTable(csv, units.joints, rows.position or [], table, duplicates, rows.session, sockets, readings)
 
@@ -413,17 +410,30 @@ def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     return (names[0], names[1]), value / table.per_metre
 
 
-def image_columns(text: str, rows: Rows) -> ImageColumns:
+def readings_columns(texts: Sequence[str], rows: Rows) -> tuple[Any, ...]:
+    """The columns of every kind of reading; those of images are of one kind, whatever number of cameras took them."""
+    corners = [text for text in texts if text.startswith(CORNERS)]
+    others = [reading_columns(text, rows.session) for text in texts if text not in corners]
+    return (*([image_columns(corners, rows)] if corners else []), *others)
+
+
+def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
     """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
 
+    Of several cameras each has a file, whose name without .yaml is that of the camera in the table.
+
     Raises:
-        InputError: neither a size nor the file of a camera.
+        InputError: neither a size nor the file of a camera; several texts one of which is no file.
     """
-    rest = text.removeprefix(CORNERS).strip()
-    size = image_size(rest.split(","))
-    camera = None if size is not None else read_camera(rest)
-    size = (camera.width, camera.height) if camera is not None else size
-    return ImageColumns(size or (0, 0), camera, rows.camera_on_tool, rows.session)
+    names = [text.removeprefix(CORNERS).strip() for text in texts]
+    size = image_size(names[0].split(","))
+    if len(names) == 1:
+        return ImageColumns(read_camera(names[0]) if size is None else size, rows.camera_on_tool, rows.session)
+    cameras = {Path(name).stem: read_camera(name) for name in names}
+    if len(cameras) < len(names):
+        fix = "name the file of each camera after the camera in the table, such as left.yaml"
+        raise InputError.of("--reading corners=", expected="a file for each camera", got=few(names), fix=fix)
+    return ImageColumns(cameras, rows.camera_on_tool, rows.session)
 
 
 def reading_columns(text: str, device: str | None) -> ReadingColumns:

@@ -12,12 +12,12 @@ from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 
-FRAME = "camera_optical_frame"
-"""The camera's frame: x right, y down, z ahead (REP 103)."""
+FRAME = "_optical_frame"
+"""A camera's frame, behind its name: x right, y down, z ahead (REP 103)."""
 
 
 def camera_files(model: CalibratedKinematics, geometry: Geometry | None = None) -> dict[str, str]:
-    """Names and contents of the files.
+    """Names and contents of the files; those of several cameras begin with the camera's name.
 
     Args:
         model: of images of a board. geometry: rigid kinematics that the camera's place belongs to; the model's own by
@@ -26,18 +26,24 @@ def camera_files(model: CalibratedKinematics, geometry: Geometry | None = None) 
     Raises:
         InputError: a model without such a camera, or one that was registered again.
     """
-    found = next((own.camera for own in model.placement if own.camera is not None), None)
-    if found is None:
+    cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
+    if not cameras:
         fix = "calibrate with a table of `images`; poses of a board tell no lens, `fit --json` has their hand-eye"
         raise InputError.of("the camera of the model", expected="one that saw a board in images", got="none", fix=fix)
-    own = HandEye.of(model, camera_on_tool=found.on_tool, geometry=geometry)
-    return {
-        "camera.yaml": camera_text(found.camera),
-        "camera_info.yaml": camera_text(found.camera, ros=True),
-        "hand_eye.yaml": _hand_eye(own),
-        "camera.xacro": _joint(own),
-        "static_transform.launch.xml": _launch(own),
-    }
+    on_tool = next(iter(cameras.values())).on_tool
+    found: dict[str, str] = {}
+    for name, own in HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry).items():
+        lens = cameras[name.partition("/")[0] if name not in cameras else name].camera
+        known = name.replace("/", "_")
+        files = {
+            "camera.yaml": camera_text(lens),
+            "camera_info.yaml": camera_text(lens, ros=True),
+            "hand_eye.yaml": _hand_eye(own),
+            "camera.xacro": _joint(own, known),
+            "static_transform.launch.xml": _launch(own, known),
+        }
+        found |= {file if len(cameras) == 1 else f"{known}_{file}": text for file, text in files.items()}
+    return found
 
 
 def _hand_eye(own: HandEye) -> str:
@@ -53,28 +59,29 @@ def _hand_eye(own: HandEye) -> str:
     return "\n".join([*lines, ""])
 
 
-def _joint(own: HandEye) -> str:
+def _joint(own: HandEye, name: str) -> str:
     """A link and a fixed joint, to include in a xacro file of the robot."""
     xyz, rpy = (" ".join(f"{value!r}" for value in part) for part in origin_numbers(own.camera.known.pose))
+    frame = quoteattr(f"{name}{FRAME}")
     return f"""<?xml version="1.0"?>
 <robot xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <link name="{FRAME}"/>
-  <joint name="camera_joint" type="fixed">
+  <link name={frame}/>
+  <joint name={quoteattr(f"{name}_joint")} type="fixed">
     <parent link={quoteattr(own.camera.link)}/>
-    <child link="{FRAME}"/>
+    <child link={frame}/>
     <origin xyz="{xyz}" rpy="{rpy}"/>
   </joint>
 </robot>
 """
 
 
-def _launch(own: HandEye) -> str:
+def _launch(own: HandEye, name: str) -> str:
     """A launch file of ROS 2 that publishes the camera's frame."""
     turn = rotation_numbers(own.camera.known.pose[None, :3, :3], "quat_xyzw")[0].tolist()
     numbers = [*own.camera.known.pose[:3, 3].tolist(), *turn]
     named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)
     words = [*(f"--{name} {value!r}" for name, value in named), f"--frame-id {own.camera.link}"]
-    arguments = quoteattr(" ".join([*words, f"--child-frame-id {FRAME}"]))
+    arguments = quoteattr(" ".join([*words, f"--child-frame-id {name}{FRAME}"]))
     return f"""<launch>
   <node pkg="tf2_ros" exec="static_transform_publisher" name="camera_transform" args={arguments}/>
 </launch>

@@ -1,19 +1,18 @@
-"""Images of a board as the columns of a table: poses, their errors, and what their lens and board do to all of them."""
+"""Images of a board as the columns of a table: poses, their errors, and what lenses and board do to all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.cameras.board import BoardPrior
-from diffeo_calib.cameras.images import Camera, Images, Sights, sighted
+from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
-from diffeo_calib.measurements.checks import check_rows, joint_table
+from diffeo_calib.common.errors import MeasurementError, listed, sentence, warn_user
+from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers
 from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.rows import RowTable, with_attributes
 
@@ -27,151 +26,237 @@ FEWEST_IMAGES = 8
 """From which a free lens is well enough known to be compared."""
 
 
-@dataclass(frozen=True)
-class KnownCamera:
-    """What is known before: the images' width and height, pixels, lens and board of a camera, prior of the board."""
-
-    size: tuple[int, int]
-    camera: Camera | None = None
-    board: BoardPrior | None = None
-
-
-IMAGE_COLUMNS = ("corners", "pose_covariance", "pose_shared")
-NO_IMAGES = dict.fromkeys((*IMAGE_COLUMNS, "camera"))
+Known = tuple[int, int] | Camera
+"""What is known of a camera before: width and height of its images, pixels, or lens and board too."""
+ONLY_CAMERA = "camera"
+"""Name of a camera that is alone."""
+OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
+IMAGE_COLUMNS = ("corners", "seen_by", *OF_POSES)
+NO_IMAGES = dict.fromkeys(IMAGE_COLUMNS) | {"cameras": {}}
 
 
 class ImageTable(RowTable):
     """What tables of images hold beside poses.
 
     Attributes:
-        corners: (N, K, 5), see :meth:`from_images`; None without images. camera: lens and board that they show.
+        corners: (N, K, 5), see :meth:`from_images`; None without images. cameras: lens and board that they show, by the
+            names of the cameras. seen_by: (N,) int64, number of the camera of each image.
         pose_covariance: (N, 6, 6) of the errors of the poses. pose_shared: (N, 6, c) effects of c errors of unit
-            variance that all images share: of lens and board. Both in the axes of :func:`pose_jacobian`.
+            variance that all images share: of lenses and board. pose_larger: (N, 6, 1) effects of a board that is
+            larger than was said, as a share. All in the axes of :func:`pose_jacobian`.
     """
 
     frames: Any
     board: Tensor | None
     lever: Any
+    session_names: tuple[str, ...]
     corners: Tensor | None
-    camera: Camera | None
+    cameras: Mapping[str, Camera]
+    seen_by: Tensor | None
     pose_covariance: Tensor | None
     pose_shared: Tensor | None
+    pose_larger: Tensor | None
 
     @classmethod
     def from_images(
         cls,
         q: object,
         corners: object,
-        size: tuple[int, int],
+        camera: Known | Mapping[str, Known],
         joint_names: Sequence[str] | None = None,
         *,
+        seen_by: Sequence[str] | None = None,
         camera_on_tool: bool = True,
-        camera: Camera | None = None,
         board: BoardPrior | None = None,
         doubt: bool = True,
     ) -> Self:
-        """N joint configurations and images of a printed board, taken by a camera on the tool or by a fixed one.
+        """N joint configurations and images of a printed board, taken by a camera on the tool or by fixed ones.
 
-        Lens, board and the board's pose in every image are found together, see :mod:`~diffeo_calib.cameras.images`;
-        what the images leave open of lens and board is estimated with the robot.
+        Lenses, board and its pose in every image are found together, see :mod:`~diffeo_calib.cameras.images`; what the
+        images leave open of lenses and board is estimated with the robot. Each of several fixed cameras is a set-up of
+        its own, see :meth:`with_sessions`: the model is in the frame of the one with most images.
 
         Args:
             q: as in the constructor.
             corners: (N, K, 5) x, y, z of the board's corners in its plane, m, and their pixels u, v (column and row, 0
                 in the middle of the first pixel); NaN for corners that an image does not show.
-            size: width and height of the images, pixels.
+            camera: width and height of its images, pixels, or what is known of its lens and board, such as
+                ``measurements.camera`` of an earlier calibration; of several cameras by their names.
             joint_names: n names, in the order of the columns of ``q``.
+            seen_by: name of the camera of each image (N,); None for one. All of them see the same board.
             camera_on_tool: whether the camera is on the tool and the board stands; otherwise the board is on the tool.
-            camera: what is known of lens and board, such as ``measurements.camera`` of an earlier calibration; None if
-                nothing is.
             board: prior of a board that is not known yet.
             doubt: see :meth:`from_poses`.
 
         Raises:
-            MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane.
+            MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane;
+                several cameras on the tool, or one of which nothing is said.
         """
         angles, joints = joint_table(q, joint_names)
-        seen = image_columns(angles, corners, KnownCamera(size, camera, board), camera_on_tool=camera_on_tool)
+        numbers, names = session_numbers(seen_by, len(angles))
+        known = _known(names or (ONLY_CAMERA,), camera)
+        seen = image_columns(angles, corners, numbers, known, board, camera_on_tool=camera_on_tool)
         named = {"camera_on_tool": camera_on_tool, "doubt": doubt}
-        return with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
+        found = with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
+        return found.with_sessions(seen_by) if len(known) > 1 else found
 
     @classmethod
     def from_poses(cls, q: Any, poses: Any, joint_names: Sequence[str] | None = None, **known: Any) -> Self:
         """See :meth:`Measurements.from_poses`."""
         raise NotImplementedError
 
+    def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Self:
+        """See :meth:`Measurements.with_sessions`."""
+        raise NotImplementedError
+
+    @property
+    def camera(self) -> Camera | None:
+        """The only camera; None without images, or of several."""
+        return next(iter(self.cameras.values())) if len(self.cameras) == 1 else None
+
+    @property
+    def camera_names(self) -> list[str]:
+        """(N,) name of the camera of each image."""
+        names = list(self.cameras)
+        return [] if self.seen_by is None else [names[number] for number in self.seen_by.tolist()]
+
+    def set_ups(self, names: Sequence[str] | None) -> Sequence[str] | None:
+        """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them."""
+        if names is None or len(self.cameras) < 2 or len(names) != len(self):
+            return names
+        pairs = zip(self.camera_names, names, strict=True)
+        return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
+
+    @property
+    def same_tool(self) -> bool:
+        """Whether the set-ups are cameras, between which nothing on the tool was mounted again."""
+        return set(self.session_names) <= set(self.cameras)
+
     @property
     def sees_board_from_tool(self) -> bool | None:
         """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board."""
-        return True if self.board is not None else False if self.camera is not None else None
+        return True if self.board is not None else False if self.cameras else None
 
-    def shared_errors(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:
-        """For images: the camera; effects (N, 9, c) of its errors of unit variance on the points of poses, m; and the
-        covariance (N, 9, 9) of the points by the noise of each image, m^2."""
-        if self.camera is not None and self.pose_shared is not None and self.pose_covariance is not None:
+    def shared_errors(self) -> Iterator[SharedErrors]:
+        """Those of images; none of other rows."""
+        if self.seen_by is not None and self.pose_shared is not None and self.pose_covariance is not None:
             slopes = self._pose_slopes()
-            yield self.camera, slopes @ self.pose_shared, slopes @ self.pose_covariance @ slopes.mT
+            noise = slopes @ self.pose_covariance @ slopes.mT
+            yield SharedErrors(self.cameras, self.seen_by, slopes @ self.pose_shared, noise)
 
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
-        away = self.frames[:, 0, :3, 3] if self.board is None else -self.board
-        return self._pose_slopes()[..., :3] @ away[..., None]
+        if self.pose_larger is None:
+            raise AssertionError("a table of images")
+        return self._pose_slopes() @ self.pose_larger
 
     def errors_along(self, R: Tensor) -> dict[str, object]:
         """Errors of poses along axes turned by R (N, 3, 3)."""
-        if self.pose_covariance is None or self.pose_shared is None:
+        if self.pose_covariance is None or self.pose_shared is None or self.pose_larger is None:
             return {}
         axes = torch.zeros_like(self.pose_covariance)
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
-        return {"pose_covariance": axes @ self.pose_covariance @ axes.mT, "pose_shared": axes @ self.pose_shared}
+        found = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
+        return dict(zip(OF_POSES, found, strict=True))
 
     def _pose_slopes(self) -> Tensor:
         return pose_jacobian(self.frames, self.lever, self.board)[:, 0]
 
 
-def image_columns(q: Tensor, corners: object, known: KnownCamera, *, camera_on_tool: bool) -> dict[str, Any]:
+class SharedErrors(NamedTuple):
+    """What images of cameras share.
+
+    Args:
+        cameras: by name. seen_by: (N,) number of the camera of each image.
+        slopes: (N, 9, c) effects of the cameras' c errors of unit variance on the points of poses, m.
+        noise: (N, 9, 9) covariance of the points by the noise of each image, m^2.
+    """
+
+    cameras: Mapping[str, Camera]
+    seen_by: Tensor
+    slopes: Tensor
+    noise: Tensor
+
+
+def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
+    """What is known of each camera; MeasurementError for one of which nothing is, or one camera for several."""
+    fix = "pass a mapping from the name of each camera to what is known of it"
+    if isinstance(camera, Mapping):
+        missing = [name for name in names if name not in camera]
+        if missing:
+            got = f"those of {listed(list(camera))}"
+            raise MeasurementError.of("`camera`", expected=f"that of {listed(missing)} too", got=got, fix=fix)
+        return {name: camera[name] for name in names}
+    if len(names) > 1 and isinstance(camera, Camera):
+        raise MeasurementError.of("`camera`", expected=f"those of {listed(names)}", got="one camera", fix=fix)
+    found: dict[str, Any] = dict.fromkeys(names, camera)
+    return found
+
+
+def image_columns(
+    q: Tensor,
+    corners: object,
+    seen_by: Tensor | None,
+    known: Mapping[str, Known],
+    board: BoardPrior | None,
+    *,
+    camera_on_tool: bool,
+) -> dict[str, Any]:
     """The columns of :meth:`Measurements.from_images`, poses among them; arguments and errors as there."""
     given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
     if given.ndim != 3 or given.shape[2] != 5:
         fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
         raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
+    if len(known) > 1 and camera_on_tool:
+        fix = "calibrate with each camera by itself, or mount the board on the tool and let the cameras stand"
+        raise MeasurementError.of("images of a camera on the tool", expected="one camera", got=len(known), fix=fix)
     check_rows(q, given, "corners")
     given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
-    images = Images(given[..., :3], given[..., 3:], *known.size)
-    _check_size(images, known.camera)
-    found = sighted(images, known.camera, known.board)
-    if known.camera is not None and len(q) >= FEWEST_IMAGES:
-        _check_camera(found, sighted(images, None, known.board))
-    shared = -found.shared if camera_on_tool else found.shared  # of inverse poses, see pose_frames.py
-    errors = {"pose_covariance": found.covariance, "pose_shared": shared}
-    return {"poses": found.poses, "corners": given, "camera": found.camera} | errors
+    seen_by = torch.zeros(len(q), dtype=torch.int64, device=HOST) if seen_by is None else seen_by
+    images = []
+    for number, (name, own) in enumerate(known.items()):
+        rows, size = given[seen_by == number], (own.width, own.height) if isinstance(own, Camera) else own
+        images.append(Images(rows[..., :3], rows[..., 3:], *size))
+        _check_size(images[-1], f" of camera '{name}'" * (len(known) > 1))
+    cameras = [own if isinstance(own, Camera) else None for own in known.values()]
+    found = sighted_by_several(images, cameras, board)
+    for name, camera, seen, shown in zip(known, cameras, found, images, strict=True):
+        if camera is not None and len(seen.poses) >= FEWEST_IMAGES:
+            _check_camera(seen, sighted(shown, None, board), name if len(known) > 1 else "")
+    order = torch.cat([(seen_by == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
+    poses, covariance, shared = (
+        torch.cat([getattr(own, name) for own in found])[order] for name in ("poses", "covariance", "shared")
+    )
+    sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see pose_frames.py
+    larger = torch.cat([poses[:, :3, 3], torch.zeros_like(poses[:, :3, 3])], 1)[..., None]
+    errors = dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
+    after = dict(zip(known, (own.camera for own in found), strict=True))
+    return {"poses": poses, "corners": given, "cameras": after, "seen_by": seen_by} | errors
 
 
-def _check_size(images: Images, camera: Camera | None) -> None:
-    """Raise MeasurementError for corners outside of the images, or a camera of another size."""
+def _check_size(images: Images, whose: str) -> None:
+    """Raise MeasurementError for corners outside of the images."""
     size = images.width, images.height
-    fix = "pass the size of the images in which the corners were found, and a camera calibrated at that size"
-    if camera is not None and (camera.width, camera.height) != size:
-        expected, got = f"images of {camera.width} x {camera.height} pixels as of the camera", f"{size[0]} x {size[1]}"
-        raise MeasurementError.of("the size of the images", expected=expected, got=got, fix=fix)
+    fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
     if not bool(images.seen.any()):
-        raise MeasurementError.of("`corners`", expected="some corners", got="NaN alone")
+        raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
     low, high = (torch.stack(list(images.pixels[images.seen].aminmax(dim=0)))).tolist()
     if min(low) < -1.0 or high[0] > size[0] or high[1] > size[1]:
         got = f"from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
         expected = f"pixels within images of {size[0]} x {size[1]}"
-        raise MeasurementError.of("the corners", expected=expected, got=got, fix=fix)
+        raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
 
 
-def _check_camera(found: Sights, free: Sights) -> None:
+def _check_camera(found: Sights, free: Sights, name: str) -> None:
     """Refuse, or warn of, images that the given camera explains worse than a free one."""
     factor = found.camera.noise / free.camera.noise
     if factor < CAMERA_WARNED:
         return
+    camera = f"camera '{name}'" if name else "camera"
     given, own = (", ".join(f"{v:.0f}" for v in one.camera.lens[:4].tolist()) for one in (found, free))
     got = f"{found.camera.noise:.2f} px with fx, fy, cx, cy = {given}, and {free.camera.noise:.2f} px with {own}"
     fix = "leave the camera out, or pass that of these images: same camera, zoom, focus and size"
     if factor > CAMERA_REFUSED:
-        what = "errors of corners with the given camera"
+        what = f"errors of corners with the given {camera}"
         raise MeasurementError.of(what, expected="no larger than with any other", got=got, fix=fix)
-    warn_user(sentence(f"the given camera does not quite fit these images: errors of corners are {got}", fix=fix))
+    warn_user(sentence(f"the given {camera} does not quite fit these images: errors of corners are {got}", fix=fix))

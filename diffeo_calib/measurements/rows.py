@@ -264,7 +264,7 @@ class RowGroups:
         return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 
-ON_HOST = ("line_numbers", "session", "socket", "device")
+ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
 """Columns of numbers that stay on the host."""
 
 

@@ -99,7 +99,7 @@ class Measurements(ImageTable, SocketTable):
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
     BY_ROW = (*BY_ROW, "covariates", *IMAGE_COLUMNS)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
-    ALIKE = (*ALIKE, "covariate_names", "camera", "remounted")
+    ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
 
     q: Tensor
     points: Tensor
@@ -281,6 +281,7 @@ class Measurements(ImageTable, SocketTable):
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
         measured = {} if self.without_device else measured
         arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std, "corners": self.corners}
+        arrays |= {"seen_by": self.seen_by if len(self.cameras) > 1 else None}
         sockets = None
         if self.sockets is not None:
             known = self.sockets.distances, self.sockets.distance_std
@@ -427,7 +428,7 @@ class Measurements(ImageTable, SocketTable):
         Raises:
             MeasurementError: not one name per row, or poses with markers mounted anew.
         """
-        numbers, known = session_numbers(names, len(self))
+        numbers, known = session_numbers(self.set_ups(names), len(self))
         if remounted and self.lever is not None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)

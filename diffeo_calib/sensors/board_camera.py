@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import astuple, dataclass
 
 import torch
@@ -61,7 +61,8 @@ class BoardCamera:
         camera, unknowns = self.camera, self.camera.unknowns
         own = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
         root = unknowns.new_zeros(SIZE, SIZE)
-        root[:, : camera.root.shape[1]] = camera.root
+        known = camera.root if camera.root.shape[1] <= SIZE else torch.linalg.qr(camera.root.mT).R.mT
+        root[:, : known.shape[1]] = known
         return torch.cat([unknowns.new_tensor([*own, *astuple(self.explained)]), root.flatten(), unknowns])
 
     @classmethod
@@ -74,7 +75,10 @@ class BoardCamera:
         camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise)
         return cls(camera, bool(on_tool), Explained(*explained))
 
-    def sentences(self) -> Iterator[str]:
-        """Lens, board, and what explains what."""
-        yield from self.camera.sentences()
-        yield self.explained.sentence()
+
+def camera_sentences(cameras: Mapping[str, BoardCamera]) -> Iterator[str]:
+    """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""
+    names = {name: f"{name}: " * (len(cameras) > 1) for name in cameras}
+    yield from (f"{names[name]}{line}" for name, own in cameras.items() for line in own.camera.sentences())
+    yield from (own.camera.board_sentence() for own in [*cameras.values()][:1])
+    yield from (f"{names[name]}{own.explained.sentence()}" for name, own in cameras.items())

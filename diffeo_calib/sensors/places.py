@@ -20,7 +20,7 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, rigid_fit
-from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera
+from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, camera_sentences
 from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
 from diffeo_calib.sensors.kinds import kind_of, known_kinds
 
@@ -342,14 +342,15 @@ class PlacedDevices:
         return known_kinds()[self.kind](self.names, self.constants, self.deviations.amax(0))
 
     @property
-    def camera(self) -> BoardCamera | None:
-        """As the camera that saw a board; None for other kinds."""
-        return BoardCamera.of(self.constants[0]) if self.kind == CAMERA else None
+    def cameras(self) -> dict[str, BoardCamera]:
+        """As the cameras that saw a board, by their names; none for other kinds."""
+        each = zip(self.names, map(BoardCamera.of, self.constants if self.kind == CAMERA else ()), strict=False)
+        return {name: own for name, own in each if own is not None}
 
     def sentences(self) -> list[str]:
         """Where each of them is in the frame of the model, with standard deviations; lens and board of a camera."""
         if self.kind == CAMERA:
-            return [] if self.camera is None else list(self.camera.sentences())
+            return list(camera_sentences(self.cameras))
         devices = self.devices
         if devices is not None:
             return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]

@@ -22,7 +22,7 @@ import torch
 import two_arms_bank
 from golden_bank import Golden
 from product_bank import simulated_poses
-from simulated_camera import camera_arm
+from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -84,6 +84,14 @@ def _images() -> Source:
     seen = camera_arm(60)
     golden = Golden(seen.arm.nominal, seen.images(0.1), golden_bank.camera_on_tool().scales, seen.q[:5])
     return _of_arm(golden, 0.3, seen.arm, (0, 1, 2))
+
+
+def _two_cameras() -> Source:
+    """Two fixed cameras, and a printed board on the tool."""
+    arms = [fixed_camera_arm(70, second=second) for second in (False, True)]
+    rows = images_of_both(arms, (33, 27), 0.1)
+    golden = Golden(arms[0].arm.nominal, rows, golden_bank.camera_on_tool().scales, rows.q[:5])
+    return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
 
 
 def _several() -> Source:
@@ -148,6 +156,7 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "images": lambda: _readings("image", 2.0),
     "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
     "images of a board": _images,
+    "two cameras": _two_cameras,
     "several kinds": _several,
     "laser beams": _beams,
     "inclinations": _inclinations,
@@ -160,7 +169,8 @@ POSITIONED = ("positions", "hidden markers")
 FREE = ("ball in sockets", "distances", "heights", "images")
 """Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
-CAMERAS = ("camera on the tool", "images of a board")
+ON_TOOL = ("camera on the tool", "images of a board")
+CAMERAS = (*ON_TOOL, "two cameras")
 
 
 def marked(*names: str) -> list[Any]:
@@ -259,7 +269,7 @@ class Kind:
     def written(self, rows: Any, path: Path) -> tuple[TableColumns, TableFormat]:
         named = rows.with_joint_names(self.robot.joint_names)
         turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in (*WITH_POSES, "inclinations") else {}
-        table = TableFormat("mm", "deg", camera_on_tool=self.name in CAMERAS, **turned)  # pyright: ignore
+        table = TableFormat("mm", "deg", camera_on_tool=self.name in ON_TOOL, **turned)  # pyright: ignore
         return write_measurements(path, named, table)
 
     @property
@@ -314,7 +324,8 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
 
 def _reading(own: Any) -> str:
     if own.kind == "corners":
-        return f"corners={own.size[0]},{own.size[1]}"
+        size = own.camera if isinstance(own.camera, tuple) else own.camera["left"]
+        return f"corners={size[0]},{size[1]}"
     names = ",".join(own.values) if isinstance(own.values, tuple) else str(own.values)
     more = "".join(f",{value}" for value in own.intrinsics) if own.kind == "image" else ""
     return f"{'displacement' if own.offset_std else own.kind}={names}{more}"

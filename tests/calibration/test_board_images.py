@@ -44,8 +44,8 @@ def calibrated() -> Any:
 
 def of_corners(corners: Tensor, q: Tensor | None = None, **known: Any) -> dc.Measurements:
     q = data().q if q is None else q
-    known = {"board": BoardPrior(scale=2e-4), **known}
-    return dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), arm().arm.nominal.joint_names, **known)
+    known = {"board": BoardPrior(scale=2e-4), "camera": (WIDTH, HEIGHT), **known}
+    return dc.Measurements.from_images(q, corners, joint_names=arm().arm.nominal.joint_names, **known)
 
 
 def error_mm(model: Any, seen: CameraArm | None = None) -> float:
@@ -64,7 +64,7 @@ def test_pixels_are_better_than_poses() -> None:
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    camera = calibrated().model.placement[0].camera.camera
+    camera = calibrated().model.placement[0].cameras["camera"].camera
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera

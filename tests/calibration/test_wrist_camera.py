@@ -20,7 +20,7 @@ from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
 from diffeo_calib.cli import record
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
@@ -87,7 +87,7 @@ def test_the_errors_of_a_camera_are_those_of_the_board_it_sees(seen: CameraArm) 
         away = rotation(turn).mT @ one.pose[:3, :3]
         small = torch.stack([away[2, 1], away[0, 2], away[1, 0]])
         assert bool((torch.cat([shift, rotation(turn) @ small]).abs() < 4 * one.deviations).all())
-    lines = "\n".join(found.sentences())
+    lines = "\n".join(hand_eye_sentences({"camera": found}))
     assert "hand-eye transform" in lines
     assert "board in the robot's base: 7" in lines, "mm"
 

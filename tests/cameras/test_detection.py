@@ -19,7 +19,7 @@ cv2 = pytest.importorskip("cv2")
 from rendered_board import BOARD, rendered, texture  # noqa: E402
 
 from diffeo_calib.cameras.detection import Board  # noqa: E402
-from diffeo_calib.cameras.folder import read_folder  # noqa: E402
+from diffeo_calib.cameras.folder import read_folders  # noqa: E402
 
 FOUND = Board.of(BOARD)
 
@@ -152,14 +152,14 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
 def test_another_dictionary_is_named(folder: Path) -> None:
     other = Board.of(BOARD.replace("DICT_5X5_100", "DICT_4X4_50"))
     with pytest.raises(MeasurementError, match="DICT_5X5"):
-        read_folder(folder, folder / "joints.csv", other)
+        read_folders([folder], folder / "joints.csv", other)
 
 
 def test_images_without_rows_are_refused(folder: Path) -> None:
     table = folder / "joints.csv"
     table.write_text("q1,q2\n1,2\n3,4\n")
     with pytest.raises(MeasurementError, match="5 images, 2 rows"):
-        read_folder(folder, table, FOUND)
+        read_folders([folder], table, FOUND)
     table.write_text("image,q1\nmissing.png,2\n")
     with pytest.raises(MeasurementError, match=r"missing\.png"):
-        read_folder(folder, table, FOUND)
+        read_folders([folder], table, FOUND)

@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.cameras.files import read_camera, write_camera
-from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted
+from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
 
@@ -71,6 +71,21 @@ def test_truth_is_found_within_its_deviations() -> None:
     known = FOUND.covariance + FOUND.shared @ FOUND.shared.mT
     squares = (errors[:, None] @ torch.linalg.solve(known, errors[..., None])).flatten()
     assert 0.3 < float(squares.mean()) / 6 < 1.7
+
+
+def test_images_of_one_camera_in_two_parts_with_a_known_lens_tell_the_same() -> None:
+    """The one board counts once: twice its prior would make its scale too certain by the square root of two."""
+    held = replace(CAMERA, half_size=0.0)
+    whole = sighted(IMAGES, held)
+    rows = torch.arange(len(IMAGES.points)) % 3 == 0
+    parts = [replace(IMAGES, points=IMAGES.points[some], pixels=IMAGES.pixels[some]) for some in (rows, ~rows)]
+    found = sighted_by_several(parts, [held, held])
+    for own, some in zip(found, (rows, ~rows), strict=True):
+        assert_close(own.camera.board, whole.camera.board, rtol=0, atol=1e-5)
+        assert_close(own.camera.deviations, whole.camera.deviations, rtol=0.05, atol=0)
+        assert_close(own.poses, whole.poses[some], rtol=0, atol=5e-5)
+        ours, theirs = (each @ each.flatten(0, 1).mT for each in (own.shared, whole.shared[some]))
+        assert_close(ours, theirs, rtol=0, atol=0.05 * float(theirs.abs().max()))
 
 
 def test_poses_and_shared_errors_are_the_whole_posterior() -> None:
@@ -194,7 +209,7 @@ def test_a_board_that_is_not_flat_is_refused() -> None:
 
 
 def test_sentences_name_everything() -> None:
-    text = " ".join(FOUND.camera.sentences())
+    text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
     assert all(name in text for name in LENS)
     assert "lengths are the board's" in text
     assert set(UNKNOWNS) < set(FOUND.camera.entry())

@@ -23,7 +23,7 @@ import diffeo_calib as dc
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.camera_files import camera_files
-from diffeo_calib.kinematics.hand_eye import HandEye, KnownPose
+from diffeo_calib.kinematics.hand_eye import HandEye, KnownPose, hand_eye_sentences
 from diffeo_calib.robots.se3 import roll_pitch_yaw, rotation
 from diffeo_calib.sensors.board_camera import BoardCamera
 
@@ -43,8 +43,7 @@ def fixed() -> dc.CalibratedKinematics:
 
 
 def camera_of(model: dc.CalibratedKinematics) -> BoardCamera:
-    found = model.placement[0].camera
-    assert found is not None
+    (found,) = [own for each in model.placement for own in each.cameras.values()]
     return found
 
 
@@ -71,7 +70,9 @@ def test_a_fixed_camera_is_where_it_is() -> None:
     check(found.board.known, BOARD_ON_FLANGE, torch.eye(3, dtype=torch.float64))
     assert found.camera.link == fixed().robot.base
     assert not camera_of(fixed()).on_tool
-    assert any("camera in the robot's base (hand-eye transform)" in line for line in found.sentences())
+    assert any(
+        "camera in the robot's base (hand-eye transform)" in line for line in hand_eye_sentences({"camera": found})
+    )
 
 
 @pytest.mark.parametrize("model", [on_tool, fixed])
@@ -146,7 +147,7 @@ def test_what_explains_the_errors_adds_up() -> None:
 def test_models_of_earlier_versions_have_lens_and_board_alone() -> None:
     placed = on_tool().placement[0]
     old = replace(placed, constants=camera_of(on_tool()).camera.unknowns[None])
-    assert old.camera is None
+    assert not old.cameras
     assert old.sentences() == []
     model = on_tool()
     poor = dc.CalibratedKinematics(model.robot, model.map, lever=model.lever, placement=(old,))

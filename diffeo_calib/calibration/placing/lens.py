@@ -1,7 +1,8 @@
-"""Lens and board of images: errors that all of them share."""
+"""Lenses and board of images: errors that all of them share."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,10 +12,11 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.cameras.board import LENS
-from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained
+from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
 from diffeo_calib.sensors.places import PlacedDevices
 
 SIZE_WARNED, SIZE_REFUSED = 0.006, 0.02
@@ -25,48 +27,106 @@ PARTS = slice(0, len(LENS)), slice(len(LENS), None)
 
 
 @dataclass(frozen=True, eq=False)
-class LensAndBoard(DeviceSet):
-    """Lens and board of a camera.
+class CameraErrors(DeviceSet):
+    """Errors of lenses, and of the board that all of the cameras saw.
 
     Args:
-        camera: as images alone show them. slopes: (M, 9, c) effects of its errors on the points of each pose, m.
-        rows: (M,) their rows of a calibration. on_tool: whether the camera is on the tool, else the board.
-        apart: (9 M, c) the same effects apart from the places of the robot and of what is on the tool.
-        explained: at the tool; what the fit says is zero before it.
+        shared: the cameras as images alone show them, and what their c errors do to the points of the M poses, m.
+        rows: (M,) rows of these poses in the whole table.
     """
 
-    camera: Camera
-    slopes: Tensor
+    shared: SharedErrors
     rows: Tensor
-    on_tool: bool
-    apart: Tensor
-    explained: Explained
 
     @classmethod
-    def of_table(cls, data: Measurements, rows: Tensor, registration: Identification) -> list[Any]:
-        """That of the images of a table, none for other tables; rows: (M,) numbers in the whole table.
+    def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
+        """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
+        return [cls(shared, rows) for shared in data.shared_errors()]
+
+    @property
+    def size(self) -> int:
+        """Errors of lenses and board."""
+        return self.shared.slopes.shape[2]
+
+    def effects(self, data: SeenRows) -> Tensor:
+        """See :class:`DeviceSet`."""
+        found = data.y.new_zeros(*data.y.shape, self.size)
+        found[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
+        return found
+
+    def settled(self, found: Settled) -> Any:
+        """See :class:`DeviceSet`."""
+        return self
+
+    def with_rows(self, other: OtherRows) -> Any:
+        """See :class:`DeviceSet`."""
+        if other.coordinates is None:
+            raise MeasurementError.of("rows of a camera", expected="images", got="none")
+        (shared,) = other.coordinates.table.shared_errors()
+        return replace(self, shared=shared, rows=other.coordinates.rows)
+
+    def placed(self) -> PlacedDevices | None:
+        """Nothing."""
+        return None
+
+    def sentences(self) -> list[str]:
+        """None."""
+        return []
+
+    def entry(self) -> dict[str, object]:
+        """Nothing."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class LensAndBoard(CameraErrors):
+    """Lenses and board of a calibration.
+
+    Args:
+        on_tool: whether the camera is on the tool, else the board.
+        apart: (M, 9, c) the same effects apart from the places of the robot and of what is on the tool.
+        explained: at the tool, by the rows of each camera; what the fit says is zero before it.
+    """
+
+    on_tool: bool
+    apart: Tensor
+    explained: tuple[Explained, ...]
+
+    @classmethod
+    def of_table(
+        cls, data: Measurements, rows: Tensor, registration: Identification, moved: Sequence[Tensor] = ()
+    ) -> list[Any]:
+        """That of the images of a table, none for other tables.
+
+        Args:
+            data: in the frame of one session. rows: (M,) numbers in the whole table. registration: of all of them.
+            moved: numbers of the rows in each other session, whose frame was found with lengths that may be wrong.
 
         Raises:
             MeasurementError: a board of another size than was said.
         """
-        found = []
-        for camera, slopes, noise in data.shared_errors():
-            corners = _rms_distance(noise.diagonal(dim1=1, dim2=2).sqrt())
-            explained = Explained(registration.rms, 0.0, 0.0, 0.0, 0.0, corners)
-            places = _places(data, registration).flatten(1, 2).flatten(0, 1)
-            apart = slopes.flatten(0, 1)
+        found, others = [], [torch.isin(rows, own) for own in moved]
+        for shared in data.shared_errors():
+            away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
+            deviations, explained = shared.noise.diagonal(dim1=1, dim2=2).sqrt(), []
+            for number in range(len(shared.cameras)):
+                own = shared.seen_by == number
+                nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
+                explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _rms_distance(deviations[own])))
+            places = _places(data, registration, others)
+            apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
-            found.append(cls(camera, slopes, rows, data.board is not None, apart, explained))
-            found[-1].check_size(data, registration)
+            on_tool = data.board is not None
+            found.append(cls(shared, rows, on_tool, apart.view_as(shared.slopes), tuple(explained)))
+            found[-1].check_size(relative_size(data, registration, others))
         return found
 
-    def check_size(self, data: Measurements, registration: Identification) -> None:
-        """Compare the board's lengths with those of the robot as described, base and hand-eye being free.
+    def check_size(self, larger: float) -> None:
+        """Compare the board's lengths with those of the robot as described, see :func:`relative_size`.
 
         Raises:
             MeasurementError: a board of another size than was said. Warns: lengths that differ less.
         """
-        larger = relative_size(data, registration)
         if abs(larger) < SIZE_WARNED:
             return
         what = "the size of the board does not fit that of the robot"
@@ -76,67 +136,60 @@ class LensAndBoard(DeviceSet):
             raise MeasurementError.of(what, expected="lengths as in the robot's description", got=got, fix=fix)
         warn_user(sentence(f"{what}: {got}", fix=fix))
 
-    @property
-    def size(self) -> int:
-        """Errors of lens and board."""
-        return self.slopes.shape[2]
-
-    def effects(self, data: SeenRows) -> Tensor:
-        """See :class:`DeviceSet`."""
-        found = data.y.new_zeros(*data.y.shape, self.size)
-        found[self.rows, : self.slopes.shape[1]] = self.slopes
-        return found
-
     def settled(self, found: Settled) -> LensAndBoard:
         """See :class:`DeviceSet`."""
-        root = self.camera.root @ torch.linalg.cholesky(found.covariance)
-        change = self.camera.root @ found.shifts
-        lens, board = (self._at_tool(change, part) for part in PARTS)
-        lens_std, board_std = (self._at_tool(root, part) for part in PARTS)
-        known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
-        camera = replace(self.camera, unknowns=self.camera.unknowns + change, root=root)
-        return replace(self, camera=camera, explained=replace(self.explained, **known))
-
-    def with_rows(self, other: OtherRows) -> LensAndBoard:
-        """See :class:`DeviceSet`."""
-        if other.coordinates is None:
-            raise MeasurementError.of("rows of a camera", expected="images", got="none")
-        ((camera, slopes, _),) = other.coordinates.table.shared_errors()
-        return replace(self, camera=camera, slopes=slopes, rows=other.coordinates.rows)
-
-    def _at_tool(self, errors: Tensor, part: slice) -> float:
-        """RMS distance, m, of points by some of the lens' and board's errors (14,) or (14, c), summed in squares."""
-        own = torch.zeros_like(errors)
-        own[part] = errors[part]
-        moved = self.apart @ torch.linalg.pinv(self.camera.root) @ own
-        return _rms_distance(moved.view(len(self.rows), self.slopes.shape[1], -1).norm(dim=2))
+        spread, cameras, explained = torch.linalg.cholesky(found.covariance), {}, []
+        for number, (name, camera) in enumerate(self.shared.cameras.items()):
+            change, root = camera.root @ found.shifts, camera.root @ spread
+            effects = self.apart[self.shared.seen_by == number] @ torch.linalg.pinv(camera.root)
+            lens, board = (_at_tool(effects, change, part) for part in PARTS)
+            lens_std, board_std = (_at_tool(effects, root, part) for part in PARTS)
+            known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
+            explained.append(replace(self.explained[number], **known))
+            cameras[name] = replace(camera, unknowns=camera.unknowns + change, root=root)
+        return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""
-        whole = torch.zeros_like(self.rows)
-        own = self._board_camera.numbers[None], self.camera.deviations[None]
-        return PlacedDevices(CAMERA, (CAMERA,), *own, self.rows, whole)
+        numbers = torch.stack([own.numbers for own in self._cameras])
+        deviations = torch.stack([own.camera.deviations for own in self._cameras])
+        return PlacedDevices(CAMERA, tuple(self.shared.cameras), numbers, deviations, self.rows, self.shared.seen_by)
 
     @property
-    def _board_camera(self) -> BoardCamera:
-        return BoardCamera(self.camera, self.on_tool, self.explained)
+    def _cameras(self) -> list[BoardCamera]:
+        each = zip(self.shared.cameras.values(), self.explained, strict=True)
+        return [BoardCamera(camera, self.on_tool, explained) for camera, explained in each]
 
     def sentences(self) -> list[str]:
         """See :class:`DeviceSet`."""
-        return list(self._board_camera.sentences())
+        return list(camera_sentences(dict(zip(self.shared.cameras, self._cameras, strict=True))))
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
-        return {"camera": self.camera.entry() | {"explained_m": vars(self.explained) | {"arm": self.explained.arm}}}
+        found = {
+            name: own.camera.entry() | {"explained_m": vars(own.explained) | {"arm": own.explained.arm}}
+            for name, own in zip(self.shared.cameras, self._cameras, strict=True)
+        }
+        return {"cameras": found} if len(found) > 1 else {"camera": next(iter(found.values()))}
 
 
-def relative_size(data: Measurements, registration: Identification) -> float:
+def _at_tool(effects: Tensor, errors: Tensor, part: slice) -> float:
+    """RMS distance, m, of points (M, 9) by some errors of lens and board, summed in squares.
+
+    Args:
+        effects: (M, 9, 14) of the unknowns of a camera, m. errors: (14,) or (14, c) of these.
+    """
+    return _rms_distance((effects[..., part] @ errors[part]).view(*effects.shape[:2], -1).norm(dim=2))
+
+
+def relative_size(data: Measurements, registration: Identification, others: Sequence[Tensor] = ()) -> float:
     """How much longer the distances of a board from its camera are than a robot as described says, as a share.
 
-    Errors of base, markers and scale that explain the residuals of the registration, by reweighted least squares.
+    Errors of base, markers, frames of other sessions (M,) and scale that explain the residuals of the registration, by
+    reweighted least squares.
     """
     geometry = registration.geometry
-    slopes = torch.cat([_places(data, registration).flatten(1, 2), data.by_board_size()], 2)
+    slopes = torch.cat([_places(data, registration, others), data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     found = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):
@@ -147,11 +200,13 @@ def relative_size(data: Measurements, registration: Identification) -> float:
     return float(found[-1])
 
 
-def _places(data: Measurements, registration: Identification) -> Tensor:
-    """Derivatives (M, P, 3, 6 + 3 P) of points by the places of the base and of what is on the tool."""
+def _places(data: Measurements, registration: Identification, others: Sequence[Tensor]) -> Tensor:
+    """Derivatives (M, 3 P, c) of points by the places of base, what is on the tool, and frames of rows (M,) boolean."""
     geometry = registration.geometry
-    slopes = geometry.sensitivities(data.q)
-    return torch.cat([slopes[..., geometry.slices[name]] for name in ("base", "tool")], 3)
+    slopes = geometry.sensitivities(data.q).flatten(1, 2)
+    found = [slopes[..., geometry.slices[name]] for name in ("base", "tool")]
+    frame = frame_slopes(data.points, data.points.mean((0, 1)))
+    return torch.cat([*found, *(frame * own[:, None, None] for own in others)], 2)
 
 
 def _rms_distance(coordinates: Tensor) -> float:

@@ -193,10 +193,12 @@ class SessionFrames(Sessions):
     Args:
         transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
         centre: (3,) about which frames turn, m; by default the middle of the rows.
+        same_tool: whether nothing on the tool was mounted again, as between cameras that see the same board.
     """
 
     transforms: Tensor
     centre: Tensor | None = None
+    same_tool: bool = False
 
     @classmethod
     def around(cls, data: Measurements, geometry: Geometry, reference: int) -> SessionFrames:
@@ -209,7 +211,7 @@ class SessionFrames(Sessions):
         names, session = sessions_of(data)
         transforms = place_sessions(seen, data).transforms
         transforms[reference] = torch.eye(4, dtype=transforms.dtype, device=HOST)
-        return cls(names, reference, session, data.markers, transforms)
+        return cls(names, reference, session, data.markers, transforms, same_tool=data.same_tool)
 
     def aligned(self, data: Any) -> Any:
         """See :class:`Sessions`."""
@@ -218,15 +220,15 @@ class SessionFrames(Sessions):
 
     @property
     def size(self) -> int:
-        """Six of each frame, and three of each marker in each session but the reference."""
-        return len(self.others) * (6 + 3 * self.markers)
+        """Six of each frame, and three of each marker that may have moved, in each session but the reference."""
+        return len(self.others) * (6 + 3 * self.markers * (not self.same_tool))
 
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
         places = data.points.unflatten(1, (-1, 3))
         frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)) if self.centre is None else self.centre)
         frame = frame if data.slopes is None else data.slopes @ frame
-        return self.of_each(torch.cat([frame, self.by_markers(data)], dim=2))
+        return self.of_each(frame if self.same_tool else torch.cat([frame, self.by_markers(data)], dim=2))
 
     def with_rows(self, other: OtherRows) -> SessionFrames:
         """See :class:`DeviceSet`."""

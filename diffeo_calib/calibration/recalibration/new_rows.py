@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import ReadingDevices
@@ -369,7 +370,7 @@ def _padded(noise: Tensor, size: int) -> Tensor:
 
 
 def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
-    """Rows that tell coordinates, in the model's frame; their noise, and the sockets."""
+    """Rows that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
     if before.coordinates is None:
         raise AssertionError("rows that tell coordinates")
     (new, rows), T, fitted = before.coordinates, before.transform, before.fitted
@@ -384,7 +385,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if sensor.visible is not None:
         y = torch.where(y.isnan(), seen[rows], y)
         noise = without_hidden(noise, sensor.coordinates(y))
-    return Told(rows, y, sensor), noise, sets
+    return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
 
 
 def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:

@@ -32,7 +32,7 @@ from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
@@ -98,7 +98,7 @@ def run(
     hand_eye = hand_eye_of(result)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
-    record.add(**({} if hand_eye is None else {"hand_eye": hand_eye.entry()}))
+    record.add(**hand_eye_entry(hand_eye))
     _record(result, in_train, held_out, vars(outputs))
     for line in _verdict(result, held_out or {}):
         say(line)
@@ -141,11 +141,11 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def hand_eye_of(result: CalibrationResult) -> HandEye | None:
-    """Camera and board; None if no camera is known to have measured the rows."""
+def hand_eye_of(result: CalibrationResult) -> dict[str, HandEye]:
+    """Cameras and board by the names of the cameras; none if no camera is known to have measured the rows."""
     own = result.placed.coordinates
     on_tool = None if own is None else own.table.sees_board_from_tool
-    return None if on_tool is None else HandEye.of(result.model, camera_on_tool=on_tool)
+    return {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
 
 
 def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
@@ -159,12 +159,12 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
 
 
 def _lines_about_places(
-    result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: HandEye | None
+    result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: dict[str, HandEye]
 ) -> Iterator[str]:
     """What was hidden, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
     placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
-    placement = placement if hand_eye is None else list(hand_eye.sentences())
+    placement = list(hand_eye_sentences(hand_eye)) or placement
     for one in (held_out or {}).values():
         yield from socket_lines(one.one, "held out")
     own, _ = divided(data)

@@ -1,47 +1,52 @@
-"""`diffeo-calib images`: a folder of images of a printed board as a table of corners that `fit` reads."""
+"""`diffeo-calib images`: folders of images of a printed board as a table of corners that `fit` reads."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.cameras.folder import read_folder
+from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.options import BoardImages
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
-from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 
 
-def run(folder: Path, joints: Path, given: BoardImages, output: Path) -> None:
-    """Find the board, and write corners, camera and overview."""
+def run(folders: Sequence[Path], joints: Path, given: BoardImages, output: Path) -> None:
+    """Find the board, and write corners, cameras and overview."""
     table = TableFormat(given.length.value, "rad", given.sep, given.decimal)
     with progress_bar() as progress:
-        found = read_folder(folder, joints, Board.of(given.board), table.sep, progress)
-    for one in found.images:
-        if one.refused:
-            say(f"{one.name}: {one.refused}: left out")
-    text, camera = io.StringIO(newline=""), output.with_suffix(".yaml")
+        found = read_folders(folders, joints, Board.of(given.board), table.sep, progress)
+    text, several = io.StringIO(newline=""), len(found) > 1
     sheet = csv.writer(text, delimiter=table.sep)
-    sheet.writerow([IMAGE, *found.header, *POINT, *PIXEL])
-    sheet.writerows(found.rows(table.per_metre, table.decimal))
-    contents = {output: text.getvalue().encode()}
-    contents[camera] = camera_text(found.camera(BoardPrior(scale=given.board_std))).encode()
+    sheet.writerow([IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several])
+    cameras, contents, refused = dict[str, Path](), dict[Path, bytes](), dict[str, str]()
+    for one in found:
+        sheet.writerows([*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal))
+        cameras[one.name] = output.with_name(f"{one.name}.yaml") if several else output.with_suffix(".yaml")
+        contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
+        own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
+        refused |= {name: reason for name, reason in own.items() if reason}
+    contents[output] = text.getvalue().encode()
     if given.overview is not None:
-        contents[given.overview] = found.page().encode()
+        contents[given.overview] = page(found).encode()
     write_together(contents)
-    corners = sum(len(one.numbers) for one in found.used)
-    width, height = found.size
-    used = f"{len(found.used)} of {len(found.images)} images of {width} x {height} pixels"
-    say(f"{used}, {corners} corners: {shown(output)}")
-    say(
-        f"fit {shown(output)} ... --reading corners={shown(camera)}, with --camera-on-tool if the camera is on the tool"
-    )
-    refused = {one.name: one.refused for one in found.images if one.refused}
-    record.add(rows=len(found.used), refused=refused, files={"table": output, "camera": camera})
+    for name, reason in refused.items():
+        say(f"{name}: {reason}: left out")
+    for one in found:
+        width, height = one.size
+        used = f"{len(one.used)} of {len(one.images)} images of {width} x {height} pixels"
+        corners = sum(len(image.numbers) for image in one.used)
+        say(f"{f'{one.name}: ' * several}{used}, {corners} corners: {shown(output)}")
+    options = " ".join(f"--reading corners={shown(path)}" for path in cameras.values())
+    say(f"fit {shown(output)} ... {options}" + ", with --camera-on-tool if the camera is on the tool" * (not several))
+    rows, files = sum(len(one.used) for one in found), {"camera": cameras[found[0].name]} if not several else cameras
+    record.add(rows=rows, refused=refused, files={"table": output, **files})

@@ -15,7 +15,7 @@ from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.images import IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
@@ -143,7 +143,7 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
     texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
-    corners = {IMAGE, *POINT, *PIXEL} if any(text.startswith(CORNERS) for text in texts) else set[str]()
+    corners = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
     return corners | {name for text in texts for name in text.rpartition("=")[2].split(",")}
 
 

@@ -246,6 +246,11 @@ class TextCells:
         header, rows = read_cells(self.path, self.sep)
         return [name.strip() for name in header], dict(rows)
 
+    @property
+    def header(self) -> list[str]:
+        """Names of the columns."""
+        return self._read[0]
+
     def texts(
         self,
         column: str,

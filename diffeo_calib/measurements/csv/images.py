@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.sensors import FileRows
+from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
-IMAGE, POINT, PIXEL = "image", ("board_x", "board_y"), ("u", "v")
-"""Columns: name of the image, place of the corner on the board in the unit of length, and pixels."""
+IMAGE, POINT, PIXEL, CAMERA = "image", ("board_x", "board_y"), ("u", "v"), "camera"
+"""Columns: name of the image, place of the corner on the board in the unit of length, pixels; name of the camera, if
+there are several."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +27,13 @@ class ImageColumns:
     """How a table holds images.
 
     Args:
-        size: width and height of the images, pixels. camera: what is known of lens and board; None if nothing is.
+        camera: width and height of the images, pixels, or what is known of lens and board; of several cameras by the
+            names in the column `camera`.
         camera_on_tool: whether the camera is on the tool; else the board is.
         device: column that names the set-up of every image; None for one.
     """
 
-    size: tuple[int, int]
-    camera: Camera | None = None
+    camera: Known | Mapping[str, Known]
     camera_on_tool: bool = False
     device: str | None = None
     word: str = "an image"
@@ -65,12 +66,20 @@ class ImageColumns:
         for number, own in enumerate(groups.values()):
             corners[number, : len(own)] = flat[own]
         first = self.own_lines(rows)
-        known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "camera": self.camera, "doubt": False}
-        data = Measurements.from_images(first.values.q, corners, self.size, rows.columns.joints, **known)
-        return data.with_sessions(first.names(self.device, "a name"))
+        known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
+        if CAMERA in rows.cells.header:
+            known["seen_by"] = first.cells.texts(CAMERA, first.lines, expected="the name of the camera")
+        data = Measurements.from_images(first.values.q, corners, self.camera, rows.columns.joints, **known)
+        set_ups = first.names(self.device, "a name")
+        return data if set_ups is None else data.with_sessions(set_ups)
 
     def _images(self, rows: FileRows) -> list[str]:
-        return rows.cells.texts(IMAGE, rows.lines, expected="the name of the image", fix="fill it in")
+        """Name of the image of each line, with that of its camera."""
+        images = rows.cells.texts(IMAGE, rows.lines, expected="the name of the image", fix="fill it in")
+        if CAMERA not in rows.cells.header:
+            return images
+        cameras = rows.cells.texts(CAMERA, rows.lines, empty=True)
+        return [f"{camera}/{image}" for camera, image in zip(cameras, images, strict=True)]
 
 
 def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
@@ -88,7 +97,7 @@ def image_sheet(
     data: Measurements, table: TableFormat, numeric: Columns, session: str | None
 ) -> tuple[list[str], list[list[Any]], ImageColumns]:
     """Header and cells of images, and how to read them; arguments as of :func:`write_measurements`."""
-    if data.corners is None or data.camera is None:
+    if data.corners is None:
         raise AssertionError("a table of images")
     number, corner = (~data.corners[..., 0].isnan()).nonzero().unbind(1)
     points = data.corners[number, corner]
@@ -96,9 +105,13 @@ def image_sheet(
     texts: list[list[Any]] = [[str(k) for k in number.tolist()], *torch.cat(values, 1).T.tolist()]
     more = {} if data.payload is None else {table.payload or "payload": data.payload.tolist()}
     more |= {table.covariates.get(name, name): values.tolist() for name, values in data.drifting.items()}
+    several = len(data.cameras) > 1
+    session = None if several and data.device_names == data.camera_names else session
     more |= {session: data.device_names} if session is not None else {}
+    more |= {CAMERA: data.camera_names} if several else {}
     texts += [[column[k] for k in number.tolist()] for column in more.values()]
-    columns = ImageColumns((data.camera.width, data.camera.height), None, data.board is not None, session)
+    sizes = {name: (camera.width, camera.height) for name, camera in data.cameras.items()}
+    columns = ImageColumns(sizes if several else sizes.popitem()[1], data.board is not None, session)
     return [IMAGE, *numeric.joints, *POINT, *PIXEL, *more], [list(row) for row in zip(*texts, strict=True)], columns
 
 

@@ -1,0 +1,220 @@
+"""A robot by images of two fixed cameras that see one board: truth, places of both, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_bank import Command
+from golden_bank import camera_on_tool
+from kind_bank import Kind, kind_named
+from simulated_camera import BOARD_ON_FLANGE, BOARD_PRIOR, CameraArm, fixed_camera_arm, images_of_both
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.cameras.files import read_camera, write_camera
+from diffeo_calib.cameras.images import UNKNOWNS
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.interop.camera_files import camera_files
+from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.measurements.rows import with_attributes
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+
+SCALES = camera_on_tool().scales
+FIXED: Any = {"camera_on_tool": False, "board": BOARD_PRIOR}
+
+
+@cache
+def arms() -> tuple[CameraArm, CameraArm]:
+    return fixed_camera_arm(70), fixed_camera_arm(70, second=True)
+
+
+@cache
+def kind() -> Kind:
+    return kind_named("two cameras")
+
+
+@cache
+def data() -> Any:
+    return images_of_both(arms(), (33, 27), 0.1)
+
+
+def of_corners(corners: Tensor | None = None, **known: Any) -> Any:
+    """The same images with other corners, or other arguments."""
+    own: dict[str, Any] = {"camera": (1280, 960), "seen_by": data().camera_names, **FIXED, **known}
+    return dc.Measurements.from_images(data().q, data().corners if corners is None else corners, **own)
+
+
+# --- truth ----------------------------------------------------------------------------------------------------------
+
+
+def test_lenses_and_the_one_board_are_found() -> None:
+    placed = next(own for own in kind().model.placement if own.cameras)
+    assert placed.names == ("left", "right")
+    for name, arm in zip(placed.names, arms(), strict=True):
+        camera = placed.cameras[name].camera
+        assert float(((camera.unknowns - arm.camera.unknowns) / camera.deviations).abs().max()) < 4.5
+        assert not placed.cameras[name].on_tool
+    one, other = (own.camera for own in placed.cameras.values())
+    assert_close(one.board, other.board, rtol=0, atol=0)
+    assert_close(one.deviations[9:], other.deviations[9:])
+
+
+def test_the_size_of_the_board_is_known_once() -> None:
+    scale = UNKNOWNS.index("scale")
+    known = [float(camera.deviations[scale]) for camera in data().cameras.values()]
+    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.02)  # images alone show no size
+    again = of_corners(camera=data().cameras)
+    known = [float(camera.deviations[scale]) for camera in again.cameras.values()]
+    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.03)
+
+
+def test_both_cameras_are_where_they_are_whoever_holds_the_frame() -> None:
+    known = {}
+    for counts in ((33, 30), (30, 33)):
+        rows = images_of_both(arms(), counts, 0.1)
+        found = HandEye.of_each(dc.calibrate(kind().robot, rows, hyperparameters=SCALES).model, camera_on_tool=False)
+        for name, arm in zip(("left", "right"), arms(), strict=True):
+            own = found[name].camera.known
+            away = own.pose[:3, 3] - torch.linalg.inv(arm.arm.truth.base)[:3, 3]
+            assert bool((away.abs() < 4 * own.deviations[:3]).all())
+            known.setdefault(name, []).append(own.deviations)
+        board = found["left"].board.known
+        assert bool(
+            ((board.pose[:3, 3] - board.pose.new_tensor(BOARD_ON_FLANGE)).abs() < 4 * board.deviations[:3]).all()
+        )
+    for one, other in known.values():
+        assert float((one / other - 1).abs().max()) < 0.15
+        assert float(one[:3].max()) < 2e-3
+
+
+def test_the_files_of_each_camera_begin_with_its_name(tmp_path: Path) -> None:
+    files = camera_files(kind().model)
+    assert Counter(name.partition("_")[0] for name in files) == {"left": 5, "right": 5}
+    for name in ("left", "right"):
+        (tmp_path / name).write_text(files[f"{name}_camera.yaml"])
+        assert f'child link="{name}_optical_frame"' in files[f"{name}_camera.xacro"]
+    one, other = (read_camera(tmp_path / name) for name in ("left", "right"))
+    assert float((one.lens[0] - 1200).abs()) < 5
+    assert float((other.lens[0] - 1000).abs()) < 5
+    assert len({files[f"{name}_hand_eye.yaml"] for name in ("left", "right")}) == 2
+
+
+def test_sessions_of_a_camera_are_set_ups_of_their_own() -> None:
+    named = data().with_sessions(["day 1"] * 30 + ["day 2"] * 30)
+    assert set(named.session_names) == {f"{camera}/day {k}" for camera in ("left", "right") for k in (1, 2)}
+    assert named.with_sessions(named.device_names).device_names == named.device_names
+    assert data().with_sessions(["left"] * 60).device_names == [
+        "left" if name == "left" else "right/left" for name in data().camera_names
+    ]
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------
+
+
+def test_several_cameras_on_the_tool_are_refused() -> None:
+    with pytest.raises(MeasurementError, match=r"camera on the tool.*got 2"):
+        of_corners(camera_on_tool=True)
+
+
+def test_a_camera_of_which_nothing_is_said_is_refused() -> None:
+    with pytest.raises(MeasurementError, match=r"`camera`.*right.*left"):
+        of_corners(camera={"left": (1280, 960)})
+    with pytest.raises(MeasurementError, match=r"`camera`.*\['left', 'right'\].*one camera"):
+        of_corners(camera=data().cameras["left"])
+
+
+def test_a_wrong_size_or_lens_names_its_camera() -> None:
+    with pytest.raises(MeasurementError, match=r"camera 'right'.*640 x 480"):
+        of_corners(camera={"left": (1280, 960), "right": (640, 480)})
+    cameras = {name: replace(camera, half_size=0.0) for name, camera in data().cameras.items()}
+    with pytest.raises(MeasurementError, match="given camera 'left'"):
+        of_corners(camera={"left": cameras["right"], "right": cameras["right"]})
+
+
+def test_a_camera_of_few_images_is_refused() -> None:
+    few = data().rows([name == "left" or k < 7 for k, name in enumerate(data().camera_names)])
+    assert Counter(few.camera_names)["right"] == 3
+    with pytest.raises(MeasurementError, match=r"'right'.*expected 4 rows, got 3"):
+        dc.calibrate(kind().robot, few)
+
+
+def test_a_board_of_another_size_is_refused_by_both_cameras() -> None:
+    wrong = data().corners.clone()
+    wrong[..., :3] *= 1.04
+    with pytest.raises(MeasurementError, match=r"size of the board.*[34].\d % larger"):
+        dc.calibrate(kind().robot, of_corners(wrong), hyperparameters=SCALES)
+
+
+def test_a_board_of_another_size_is_refused_in_every_session_of_a_camera() -> None:
+    arm = arms()[0]
+    q, corners = arm.shown(0.1)
+    seen = dc.Measurements.from_images(q, corners * corners.new_tensor([1.04] * 3 + [1] * 2), (1280, 960), **FIXED)
+    with pytest.raises(MeasurementError, match=r"size of the board.*[34].\d % larger"):
+        dc.calibrate(
+            kind().robot, seen.with_sessions(["day 1"] * 40 + ["day 2"] * (len(q) - 40)), hyperparameters=SCALES
+        )
+
+
+def test_not_one_camera_per_image_is_refused() -> None:
+    with pytest.raises(MeasurementError, match="60"):
+        of_corners(seen_by=["left"] * 7)
+
+
+def test_images_of_other_cameras_are_not_joined() -> None:
+    with pytest.raises(MeasurementError, match="cameras"):
+        dc.Measurements.joined([data(), of_corners()])
+
+
+# --- the command line -----------------------------------------------------------------------------------------------
+
+
+def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> None:
+    table, options = kind().table()
+    shutil.copy(table, tmp_path / "corners.csv")
+    for name, camera in kind().data.cameras.items():
+        write_camera(tmp_path / f"{name}.yaml", camera)
+    files = [f"--reading=corners={tmp_path / f'{name}.yaml'}" for name in ("left", "right")]
+    others = [word for word in options if "corners" not in word and word != "--reading"]
+    words = ["fit", tmp_path / "corners.csv", *kind().robot_options, *others, "--holdout", "0"]
+    words += ["-o", tmp_path / "m.safetensors"]
+    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: kind().result)
+    done = command(*words, *files)
+    assert done.code == 0, done.err
+    assert "camera 'right' in the robot's base (hand-eye transform)" in done.out
+    done = command(*words, files[0], "--reading=corners=1280,960")
+    assert done.code == 1, done.out
+    assert "1280,960" in done.err
+    (tmp_path / "right.yaml").rename(tmp_path / "rihgt.yaml")
+    done = command(*words, files[0], files[1].replace("right", "rihgt"))
+    assert done.code == 1
+    assert "expected that of ['right'] too" in " ".join(done.err.split())
+
+
+def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path) -> None:
+    table, _ = kind().table()
+    shutil.copy(table, tmp_path / "corners.csv")
+    for name, camera in kind().data.cameras.items():
+        write_camera(tmp_path / f"{name}.yaml", camera)
+    done = command("init", tmp_path / "corners.csv", kind().urdf, "-o", tmp_path / "campaign.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "campaign.toml").read_text()
+    assert "left.yaml" in text
+    assert "right.yaml" in text
+    assert "session" not in text
+    assert "all columns are used" in text
+
+
+def test_corners_seen_along_the_way_stay_with_their_camera() -> None:
+    part = data().rows(slice(0, 20)).to("cpu")
+    assert part.camera_names == data().camera_names[:20]
+    assert part.camera is None
+    assert with_attributes(part, corners=None).sha256 != part.sha256
