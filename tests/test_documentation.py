@@ -58,6 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("joints", test[:60]),
         ("program", test[:40]),
         ("new", test[:15]),
+        ("check", test[15:40]),
     ):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
     write_socket_table(place / "block.csv", arm, "01", 0)

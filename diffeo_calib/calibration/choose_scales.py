@@ -164,6 +164,7 @@ def _inflated(
     factor, row_scales, resting = 1.0, None, measurements.places >= 0
     if not bool(resting.all()):
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
+        factor = max(factor, measurements.smallest_inflation)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
     if bool(resting.any()):
         row_scales = found.scales.inflated(max(factor, left_out.inflation(int(measurements.groups().max()) + 1)) ** 0.5)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,13 @@ def _size(word: str) -> tuple[int, int]:
 
 
 def _dictionary(cv2: Any, name: str) -> Any:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    """A dictionary of markers by OpenCV's name for it, with or without DICT_."""
+    known = [one for one in dir(cv2.aruco) if one.startswith("DICT_")]
+    whole = name if name.startswith("DICT_") else f"DICT_{name}"
+    if whole not in known:
+        near = get_close_matches(whole, known, n=3)
+        raise InputError.of("the dictionary of markers", expected=f"such as {few(near or known[:3])}", got=name)
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, whole))
 
 
 def _all_markers(detector: Any, grey: np.ndarray) -> list[int]:

@@ -31,7 +31,7 @@ RENAMED = {
 _arguments: list[str] = []
 """Of the command that runs."""
 _renamed: list[str] = []
-"""What to say about former names among them."""
+"""Warnings about former names among them."""
 
 
 def command_line() -> str:

@@ -198,7 +198,7 @@ class _Job:
         )
 
     def report(self) -> str:
-        """What it printed, under a heading."""
+        """Its output, under a heading."""
         self.output.seek(0)
         text = self.output.read().decode("utf-8", "replace")
         self.output.close()

@@ -29,7 +29,7 @@ PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
 PIXELS = ("u", "v"), ("pixel_u", "pixel_v"), ("u_px", "v_px")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
-"""What the user is to fill in, and what stands for it while other rows are read."""
+"""Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
 PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
 COVARIATES = {

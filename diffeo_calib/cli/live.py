@@ -20,7 +20,7 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
-"""What a journal keeps of a verdict."""
+"""Fields of a verdict in a journal."""
 ID = "id"
 """Column that tells rows apart."""
 
@@ -199,7 +199,7 @@ class Live:
             yield {"row": row} | {name: getattr(self.campaign.verdicts[row], name) for name in KEPT}
 
     def answer(self, number: int) -> Entry:
-        """What became of a line."""
+        """Outcome of a line."""
         known, found = self.campaign.verdicts, dict[str, Any](line=number + 2)
         if number in self.unreadable:
             return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}

@@ -112,7 +112,7 @@ def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
 
 
 def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """What becomes of a drift of the fit where new rows of another date are compared or joined with it."""
+    """How a drift of the fit is treated where new rows of another date are compared or joined with it."""
     drift = KnownDrift.of(model)
     if drift is not None:
         yield f"{drift.of_another_date}: these rows meet the model as it was at {drift.holds()}"

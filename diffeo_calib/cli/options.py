@@ -70,7 +70,7 @@ class ToolFrom(str, Enum):
 
 
 class Free(str, Enum):
-    """What may have moved."""
+    """Parts of the set-up that may have moved."""
 
     both = "both"
     base = "base"
@@ -87,7 +87,7 @@ class MarkerFreedom(str, Enum):
 
 
 class Drift(str, Enum):
-    """What may have changed in the robot itself."""
+    """Changes of the robot itself that are considered."""
 
     tested = "tested"
     none = "none"
@@ -182,7 +182,7 @@ class StoredUnits(Format):
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """What was measured in the rows of a table, of whatever kinds they are."""
+    """Columns of the measurements in a table, of any kinds."""
 
     position: list[str] | None = option(
         "The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.", "X,Y,Z"
@@ -303,7 +303,7 @@ class LiveOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What to do with the errors of a model."""
+    """Uses of the errors of a model."""
 
     register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
     free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
@@ -323,7 +323,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """What a report shows."""
+    """Contents of a report."""
 
     data: Path | None = option(
         "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
@@ -388,7 +388,7 @@ class Correction:
         "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
     )
     rate: float | None = option(
-        "The rows are a path: the correction of a joint changes by at most so many degrees from row to row.", "DEG"
+        "The rows are a path: the correction of a joint changes by at most this many degrees from row to row.", "DEG"
     )
     payload_mass: Mass = None
 
@@ -474,7 +474,7 @@ class Candidates:
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """What is planned for."""
+    """Purpose of a plan."""
 
     robot: Path | None = option("The robot's description, to plan the first poses.", "URDF")
     base: str | None = option("With --robot: first link of the chain.", "LINK")

@@ -1,4 +1,4 @@
-"""What `diffeo-calib init` proposes beyond joints and positions: rotations and standard deviations, if they fit."""
+"""Proposals of `diffeo-calib init` beyond joints and positions: rotations and standard deviations, if they fit."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class RowColumns:
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
-    """What a table seems to hold beside its joints."""
+    """The probable contents of a table beside its joints."""
     sockets = guess_sockets(sheet.header) or []
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
     markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
@@ -276,7 +276,7 @@ class Source:
         return f"{1e3 * residual:.3g} mm" if self._in_metres else f"{100 * residual:.3g} %"
 
     def words(self, best: float, others: float) -> str:
-        """What residuals say for the best units, and the least of those in other units."""
+        """Residuals with the best units, and the smallest with other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
         what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
         what = "median residual of the nominal robot" if self._in_metres else what

@@ -1,4 +1,4 @@
-"""What a command found, for programs: --json FILE. The format is that of result.schema.json, with its own version.
+"""Results of a command for programs: --json FILE. The format is that of result.schema.json, with its own version.
 
 A command adds its results while it runs. The file is written when the command ends, with its exit code, its warnings
 and its error if there was one. The result of an earlier run is removed before anything else: a command that ends before

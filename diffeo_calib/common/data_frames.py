@@ -131,7 +131,7 @@ ARRAY_KINDS = {
     "M": "dates",
     "V": "records with named fields",
 }
-"""What NumPy would convert to numbers, or cut down to real ones, without a warning."""
+"""Kinds of arrays that NumPy would convert to real numbers without a warning."""
 
 
 def real_array(value: object) -> np.ndarray:

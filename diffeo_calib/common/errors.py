@@ -109,7 +109,7 @@ def listed(items: Sequence[str]) -> str:
 
 
 def shown(value: object, most: int = LONGEST_NAME) -> str:
-    """What a message shows of a value: one line of at most ``most`` characters, without control characters.
+    """A value as a message shows it: one line of at most ``most`` characters, without control characters.
 
     Names and cells come from files: they may be long, and hold escape sequences that a terminal would obey.
     """

@@ -36,7 +36,7 @@ FIXES = {
     errno.EFBIG: FULL,
     errno.ENOENT: "make its folder first, or name a file in another folder",
 }
-"""What to do about failures."""
+"""Advice on failures."""
 
 _unfinished: set[Path] = set()
 """Temporary files of this process."""

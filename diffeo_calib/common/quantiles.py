@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 MOST_FOR_TORCH = 1 << 24
-"""Most values of which torch gives quantiles."""
+"""Largest number of values for which torch computes quantiles."""
 
 
 def quantile(values: Tensor, fraction: float) -> float:

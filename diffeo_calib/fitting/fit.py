@@ -284,7 +284,7 @@ points, and in the fit that starts the fit of all rows."""
 
 
 def sample(problem: Problem) -> Tensor | None:
-    """Sorted numbers of random rows that stand for all rows of a problem; None if there are not so many."""
+    """Sorted numbers of random rows that stand for all rows of a problem; None if there are fewer."""
     count = max(1, SAMPLE_COORDINATES // problem.y.shape[1])
     if len(problem.x) <= count:
         return None

@@ -116,7 +116,7 @@ class FittedMap:
         return self.new_noise.shape[0]
 
     registration: Any = None
-    """What a registration found, where the map has been placed anew."""
+    """Result of a registration, where the map has been placed anew."""
     _origin: FittedMap | None = None
     """The map with the nominal map of the fit, whose rows all covariances follow from."""
 

@@ -122,7 +122,7 @@ class Objective(ABC, Generic[D]):
         return deformation(self.x) if self.reduced else deformation.z1
 
     def values(self, deformation: D) -> Tensor:
-        """What was measured, as k1 predicts it: (N, m), or h(k1) (N, r)."""
+        """Predicted measurements: k1 (N, m), or h(k1) (N, r)."""
         points = self.coordinates(deformation)
         return points if self.observe is None else self.observe.value(points)
 

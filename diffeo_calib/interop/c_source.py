@@ -69,7 +69,7 @@ class CFiles:
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What a source has built in apart from the program.
+    """Constants built into a source, apart from the program.
 
     Args:
         tool: (4, 4) tool centre point in the tip's frame [m].
@@ -136,7 +136,7 @@ def c_files(
     prefix: str | None = None,
     tip: str | None = None,
 ) -> CFiles:
-    """What :func:`write_c` writes."""
+    """The files that :func:`write_c` writes."""
     carrier = checked_tip(model.robot, model.tool_tip if tip is None else tip)
     source, header = _paths(Path(path))
     name = _prefix(source.stem, prefix)

@@ -22,7 +22,7 @@ ENTRY = "diffeo_calib"
 """Key of the header in the file's metadata."""
 
 UNSOUND = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-"""What contents raise that do not fit together: forged headers hold any value in any place."""
+"""Raised by contents that do not fit together: a forged header can hold any value in any place."""
 
 Header = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""What the exports share: numbers and units in texts."""
+"""Numbers and units in texts, for all exports."""
 
 from __future__ import annotations
 

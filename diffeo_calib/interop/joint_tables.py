@@ -1,4 +1,4 @@
-"""What controllers take joint by joint: joint offsets, and tables of corrections against joint value.
+"""Files for controllers that correct joint by joint: joint offsets, and tables of corrections against joint value.
 
 Signs. The robot's joint is at ``reading + e(reading)`` when its encoder reads ``reading``, e the transmission error. To
 bring the joint itself to q, command c with c + e(c) = q: the correction c - q is what a controller adds to q. A joint

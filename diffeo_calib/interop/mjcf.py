@@ -10,15 +10,15 @@ URDF. Meshes, actuators and contacts are not written: take these bodies' places 
 
 from __future__ import annotations
 
+from importlib import import_module
 from math import isfinite
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lxml import etree
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -28,6 +28,8 @@ from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw
 from diffeo_calib.robots.tree import BASE, Tree
 from diffeo_calib.robots.urdf_elements import xml_of
+
+etree = import_module("lxml.etree")  # compiled, without type stubs
 
 SMALLEST_MASS_KG, SMALLEST_INERTIA = 1e-3, 1e-9
 """Of bodies without <inertial>: MuJoCo refuses moving bodies without mass."""
@@ -42,8 +44,9 @@ def write_mjcf(kinematics: CalibratedKinematics | Geometry, path: str | PathLike
         path: the file to write.
 
     Raises:
-        InputError: a base that is not above all other links, a mimic joint that several joints drive, or the file
-            cannot be written.
+        InputError: a base that is not above all other links, a mimic joint that several joints drive, or one that is
+            not in the chain, or the file cannot be written.
+        RobotError: masses or inertias in the URDF that are no numbers.
     """
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     write_whole(path, mjcf_text(geometry).encode())
@@ -74,7 +77,7 @@ def mjcf_text(geometry: Geometry) -> str:
     if mimics:
         together = etree.SubElement(root, "equality")
         for joint in mimics:
-            etree.SubElement(together, "joint", **_following(joint))
+            etree.SubElement(together, "joint", **_following(joint, chain))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
@@ -97,18 +100,18 @@ def _motion(joint: Joint) -> dict[str, str]:
     return found
 
 
-def _following(joint: Joint) -> dict[str, str]:
+def _following(joint: Joint, chain: Tree) -> dict[str, str]:
     """A mimic joint as a polynomial of the joint that drives it."""
     drivers = list((joint.mimic or {}).items())
-    if len(drivers) != 1:
-        fix = "write a URDF, or the whole model as a program"
-        raise InputError.of(f"mimic joint '{joint.name}'", expected="one joint that drives it", got=drivers, fix=fix)
+    if len(drivers) != 1 or drivers[0][0] not in chain.moving_names:
+        fix, expected = "write a URDF, or the whole model as a program", "one joint of the chain that drives it"
+        raise InputError.of(f"mimic joint '{joint.name}'", expected=expected, got=drivers, fix=fix)
     (driver, factor), *_ = drivers
     return {"joint1": joint.name, "joint2": driver, "polycoef": f"{joint.mimic_offset!r} {factor!r} 0 0 0"}
 
 
 class _Links:
-    """What the URDF of a robot says about the link below each joint; nothing without a URDF."""
+    """Names and inertias of the links below each joint, from the robot's URDF; empty without one."""
 
     def __init__(self, chain: Tree) -> None:
         self._names: dict[str, str] = {}
@@ -124,16 +127,23 @@ class _Links:
         return self._names.get(joint, joint)
 
     def inertial(self, joint: str) -> dict[str, str] | None:
-        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF says nothing."""
+        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF has none."""
         element = self._inertials.get(self.name(joint))
-        mass, inertia = (None if element is None else element.find(tag) for tag in ("mass", "inertia"))
+        if element is None:
+            return None
+        mass, inertia = element.find("mass"), element.find("inertia")
         if mass is None or inertia is None:
             return None
-        xyz, R = _place(element.find("origin"))
-        ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in MOMENTS)
+        try:
+            kilograms = float(mass.get("value", ""))
+            ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in MOMENTS)
+            xyz, R = _place(element.find("origin"))
+        except (TypeError, ValueError) as error:
+            what = f"<inertial> of link '{self.name(joint)}' in the URDF"
+            raise RobotError.of(what, expected="numbers", got=str(error), fix="correct the file") from None
         turned = R @ R.new_tensor([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.mT
         moments = turned[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        return {"mass": mass.get("value"), "pos": xyz, "fullinertia": _text(moments)}
+        return {"mass": repr(kilograms), "pos": xyz, "fullinertia": _text(moments)}
 
 
 MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")

@@ -216,7 +216,7 @@ def check_program(
 
 
 def description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:
-    """What a program computes, as text by subject."""
+    """Description of a program's inputs and outputs, as text by subject."""
     found = {"output": output, "units": "m, rad"}
     if isinstance(model, CalibratedKinematics):
         found |= {"robot": model.robot.name, "joints": ", ".join(model.robot.joint_names)}

@@ -121,7 +121,7 @@ def _number(value: float) -> str:
 
 
 def _prefix(chain: Tree) -> str:
-    """What stands before the names of a Universal Robots arm's joints and links; often nothing.
+    """Prefix of the names of a Universal Robots arm's joints and links; often empty.
 
     Raises:
         RobotError: another robot, or another base.

@@ -36,7 +36,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link
 from diffeo_calib.sensors.places import PlacedDevices
 
 
@@ -191,6 +191,7 @@ class CalibratedKinematics:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
         rows = registration_rows(measurements, self)
+        check_payload_link(self.nominal.load.link, measurements)
         if rows is None:
             check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
@@ -203,7 +204,7 @@ class CalibratedKinematics:
 
     @property
     def registration(self) -> Registration | None:
-        """What the registration found if the model was registered; None for a model in the place of its fit."""
+        """Result of the registration; None for a model in the place of its fit."""
         return self.map.registration
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
@@ -393,7 +394,7 @@ class CalibratedKinematics:
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
 
     def predict_readings(self, q: object, *, noise: bool = True) -> list[PredictedReadings]:
-        """What the devices of the fit will read of the ball: distances, heights, images, each in its unit.
+        """Predicted readings of the fit's devices: distances, heights, images, each in its unit.
 
         Args:
             q: (N, n) joint configurations.
@@ -477,5 +478,5 @@ class CalibratedKinematics:
 
 
 def measured_words(model: Any) -> str:
-    """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
+    """Targets of the calibration, such as "poses" or "2 marker(s)"."""
     return kind_of_points(model.markers, model.lever)

@@ -1,4 +1,4 @@
-"""What devices in known places will report: readings of the ball of a calibrated model, with their covariances.
+"""Predicted readings of devices in known places, with their covariances.
 
 A reading at q is h(z(q), d), z the ball and d what is known of the device, both found from the same rows. Their errors
 belong together: whatever no row tells apart, such as the place of the whole scene, moves both and no reading. With
@@ -29,7 +29,7 @@ from diffeo_calib.sensors.places import MOUNTING, PlacedDevices, seen_mounted
 
 @dataclass(frozen=True, eq=False)
 class PredictedReadings:
-    """What one device will report at N configurations.
+    """Predicted readings of one device at N configurations.
 
     Args:
         kind: of its readings; "position" of markers that were mounted anew. device: its name, or that of the session.
@@ -90,7 +90,7 @@ class _Device(NamedTuple):
         return cls(devices, number, deviations, columns, noise)
 
     def observation(self, rows: int) -> Observation:
-        """What so many rows of it observe, m."""
+        """Its observation for a number of rows, m."""
         return self.devices.observation(torch.full((rows,), self.number, dtype=torch.int64, device=HOST))
 
     def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
@@ -112,7 +112,7 @@ class _Device(NamedTuple):
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
-    """What every device that a model knows will report of the ball; nothing for devices that measure coordinates.
+    """Predicted readings of every device that a model knows; empty for devices that measure coordinates.
 
     Args:
         model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.

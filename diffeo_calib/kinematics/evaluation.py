@@ -23,7 +23,7 @@ from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
+from diffeo_calib.sensors.coordinates import Beside, check_joint_order, check_payload_link, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
@@ -99,6 +99,7 @@ def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
     """Refuse rows of other joints, tips and kinds than those of a calibrated model."""
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
+        check_payload_link(kinematics.nominal.load.link, data)
         for table, _ in rows_of_one_kind(data):
             sensor_of(table).check(table, kinematics)
 
@@ -134,7 +135,11 @@ def devices_of(model: object) -> dict[str, Devices]:
     """The devices of readings whose places a model knows, by kind; none for other kinematics."""
     sets = getattr(model, "placement", None) or ()
     known = [own if isinstance(own, Devices) else getattr(own, "devices", None) for own in sets]
-    return {own.kind: own for own in known if isinstance(own, Devices)}
+    found = dict[str, Devices]()
+    for own in known:
+        if isinstance(own, Devices):
+            found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    return found
 
 
 def session_frames(model: object) -> dict[str, Tensor]:
@@ -308,7 +313,7 @@ def warn_outside_range(model: CalibratedKinematics, q: object, *, refuse_other_u
 
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
-    """Whether errors are so large that they say nothing about the robot: a median above a tenth of its reach."""
+    """Whether errors are too large to describe the robot: a median above a tenth of its reach."""
     return implausibly_far(model, errors.median)
 
 

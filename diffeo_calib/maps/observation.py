@@ -1,4 +1,4 @@
-"""What devices that measure no position see of a point: a distance, a height above a plane, an image.
+"""Observations of a point by devices that measure no position: a distance, a height above a plane, an image.
 
 Row i reports r numbers h_i(z), z = k1(x_i) in R^m, with slopes A_i = Dh_i(z) (r x m). To first order the row is a
 measurement of the linear functional A_i k1(x_i): with it the covariance G of k1 becomes A G A^T, and the end condition
@@ -218,7 +218,7 @@ class CameraPoints(Observation):
 
 @dataclass(frozen=True)
 class Part:
-    """What some rows of a :class:`Stacked` observation report.
+    """The rows of one kind in a :class:`Stacked` observation.
 
     Args:
         rows: (M,) numbers of the rows. points: (k,) numbers of the coordinates that they see, of the m of a row.

@@ -44,17 +44,29 @@ def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], R
             wanted = [one for one in reader.connections if one.topic in (joints, seen)]
             for one, _, raw in reader.messages(connections=wanted):
                 message: Any = reader.deserialize(raw, one.msgtype)
-                time = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+                time = _time(message, one.topic)
                 if one.topic == seen:
                     places.append([time, *_place(message, seen)])
                     continue
                 names = names or list(message.name)
                 if names != list(message.name):
                     raise MeasurementError.of(f"{joints}: joint states of {few(names)} and of {few(message.name)}")
+                if len(message.position) != len(names):
+                    got = str(len(message.position))
+                    raise MeasurementError.of(f"positions in {joints}", expected=f"{len(names)} joints", got=got)
                 states.append([time, *message.position])
     except (OSError, AnyReaderError) as error:
         raise InputError.of(f"{bag} cannot be read", expected="a ROS 2 bag", got=str(error)) from error
     return _recording(states, joints), names, _recording(places, seen)
+
+
+def _time(message: Any, topic: str) -> float:
+    """Of the header, s."""
+    header = getattr(message, "header", None)
+    if header is None:
+        fix = "record the stamped kind of message"
+        raise MeasurementError.of(f"messages of {topic}", expected="a header", got=type(message).__name__, fix=fix)
+    return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
 def _place(message: Any, topic: str) -> list[float]:

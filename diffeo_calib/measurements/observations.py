@@ -340,3 +340,17 @@ def _check_joinable(tables: Sequence[Any]) -> None:
     if len(tips) > 1:
         fix = "the ball in sockets and that of readings is one: pass the rows of one ball"
         raise MeasurementError.of("the ball of the tables", expected="one tip", got=few(sorted(tips)), fix=fix)
+    _check_device_names([table for table in tables if table.kind not in WITH_POSITION])
+
+
+def _check_device_names(tables: Sequence[Any]) -> None:
+    """Raise MeasurementError for devices of the same kind and name that read in several ways: which one is meant?"""
+    ways = dict[tuple[str, str], set[object]]()
+    for table in tables:
+        for name in set(table.device_names):
+            ways.setdefault((table.kind, name), set()).add(table.column_kind)
+    found = [f"{kind}s of '{name}'" for (kind, name), own in ways.items() if len(own) > 1]
+    if found:
+        expected = "one kind of zero, lens, unit and known deviations for a device"
+        fix = "name different devices differently, and give the deviations of all readings of a device, or of none"
+        raise MeasurementError.of(few(sorted(found)), expected=expected, got="several", fix=fix)

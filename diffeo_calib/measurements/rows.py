@@ -188,6 +188,11 @@ class RowGroups:
         return True
 
     @property
+    def smallest_inflation(self) -> float:
+        """Smallest factor on variances that errors of left-out rows justify: no reading shows every direction."""
+        return 1.0 if self.without_device else 0.0
+
+    @property
     def resting(self) -> tuple[Self, ...]:
         """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
         return ()

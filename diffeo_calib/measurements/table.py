@@ -455,9 +455,14 @@ class Measurements(ImageTable, SocketTable):
         hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
         return "" if self.session is None else hint
 
+    @property
+    def present_sessions(self) -> tuple[str, ...]:
+        """Names of the sessions that have rows here: a part of a table keeps the names of all."""
+        return tuple(name for name in dict.fromkeys(self.device_names) if name)
+
     def largest_session(self) -> Measurements:
         """The rows of the session with most of them; all rows if there is one."""
-        if self.session is None or len(self.session_names) < 2:
+        if self.session is None or len(self.present_sessions) < 2:
             return self
         largest = torch.bincount(self.session[self.session >= 0]).argmax()
         return self.rows(self.session == largest).with_sessions(None)

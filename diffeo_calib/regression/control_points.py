@@ -147,7 +147,7 @@ class ControlPointRegression(FeatureConditional):
         return len(self.core)
 
     def features(self, at: Linearisation) -> Features:
-        """What the controls can express of the fields, and its posterior together with that of the parameters."""
+        """Part of the fields that the controls can express, and its posterior together with that of the parameters."""
         rows = self._rows(at)
         with large_work(rows.numel()):
             expressed = self._whiten(rows.T)  # (size, M r)

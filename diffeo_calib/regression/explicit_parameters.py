@@ -66,7 +66,7 @@ class ExplicitParameterRegression(FeatureConditional, DataConditional):
         return fields - known @ known.mT
 
     def features(self, at: Linearisation) -> Features:
-        """What the data tell about the fields (M r, S), and what they leave of the parameters (M r, K + c)."""
+        """Information of the data about the fields (M r, S), and about the parameters without it (M r, K + c)."""
         cross = self.fields.gram(at.fields).T
         cross = cross if self.dense.seen is None else cross[:, self.dense.seen]
         with large_work(cross.numel()):
@@ -77,7 +77,7 @@ class ExplicitParameterRegression(FeatureConditional, DataConditional):
         return Features.of((known.T, -1), (unknown.T, 1))
 
     def shift_features(self) -> Tensor:
-        """What the data leave of the shifts."""
+        """Posterior of the shifts."""
         own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)
         own = own[:, len(own) - self.shifts :]
         left = torch.linalg.solve_triangular(self.core, own, upper=False)

@@ -33,7 +33,7 @@ FACTORS = 0.01, 1e4
 
 @dataclass(frozen=True)
 class RegionPrior:
-    """What is believed of errors before they are seen: log-normal distributions.
+    """Prior of the scale of errors: log-normal distributions.
 
     Args:
         scale_efolds: standard deviation of log s around zero.

@@ -30,7 +30,7 @@ PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500
 """The last rows, and poses."""
 ALIVE_SECONDS = 10.0
-"""After this long without news a page is told that the campaign is alive; closed ones are noticed then."""
+"""After this long without news, the page receives a sign of life; closed ones are noticed then."""
 HEADER = "X-Campaign"
 
 
@@ -61,7 +61,7 @@ class Page:
             self._news.notify_all()
 
     def states(self) -> Iterator[str]:
-        """What to show, from now on; empty texts in between."""
+        """Events to show from now on; empty texts in between."""
         seen = -1
         while True:
             with self._news:
@@ -105,7 +105,7 @@ def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
 
 
 def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> dict[str, Any]:
-    """What the page shows: lengths in mm, places in m in the robot's base.
+    """Data of the page: lengths in mm, places in m in the robot's base.
 
     Args:
         words: the expected error, and the next poses. found: these.

@@ -35,7 +35,7 @@ class PlacePriors:
 
     Args:
         marker_m: of a marker from the tip: no tool is larger.
-        open_base_m, open_base_rad: of a base about which the rows say nothing, around any place: a turn may be half of
+        open_base_m, open_base_rad: of a base that the rows do not determine, around any place: a turn may be half of
             one.
         sought_base_m_rad: of a base or a measuring frame around the start of a search: no constraint.
         found_m_rad: of a base, a marker, a device or a socket around the place where it was found: wide.

@@ -61,7 +61,7 @@ class JointElement:
 
 @dataclass(frozen=True)
 class URDF:
-    """What a file says about a robot's kinematics.
+    """The kinematics of a robot in a file.
 
     Args:
         path: the file, for messages. name: the robot's. links: names of its links. joints: all of them, in order.

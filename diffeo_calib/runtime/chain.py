@@ -173,7 +173,7 @@ class CalibratedChain:
 
 
 class Operations(NamedTuple):
-    """What the poses need of an array library beside operators: NumPy's here, torch's in interop/torch_modules.py."""
+    """Functions of an array library for poses: NumPy's here, torch's in interop/torch_modules.py."""
 
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]

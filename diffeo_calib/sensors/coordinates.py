@@ -36,6 +36,7 @@ from diffeo_calib.sensors.places import (
     Places,
     SessionPlaces,
     Turns,
+    check_same_markers,
     place_sessions,
     placed,
     sensor_key,
@@ -154,13 +155,7 @@ class Positions(Sensor):
         """Distances, and angles of poses."""
         names, data = data.device_names, places.aligned(data)
         points = points[:, :-1] if places.ball and points.shape[1] == data.markers + 1 else points
-        if points.shape != data.points.shape:
-            raise InputError.of(
-                "the model and the measurements do not have the same markers",
-                expected=f"predictions of shape {tuple(data.points.shape)}",
-                got=tuple(points.shape),
-                fix="evaluate on the markers that the model was calibrated with, in the same order",
-            )
+        check_same_markers(points, data.points)
         whole = Evaluation(data.points[..., 0], line_numbers=data.line_numbers, devices=names, kind=data.kind)
         return self._errors(whole, data, points)
 
@@ -173,9 +168,10 @@ class Positions(Sensor):
         return data.largest_session()
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        """The frames of several set-ups, or their markers; those of one are those of the model."""
-        if len(data.session_names) < 2:
-            return ()
+        """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
+        names = data.present_sessions
+        if len(names) < 2:
+            return (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),) if names else ()
         if data.remounted:
             own = MountedMarkers.of(points, data, turns)
             shifts, deviations = own.shifts.flatten(1), own.deviations.flatten(1)
@@ -271,8 +267,7 @@ class OtherDevices(Sensor):
         devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
         if known is not None:
-            all_names, constants = (*known.names, *devices.names), torch.cat([known.constants, devices.constants])
-            devices = replace(known, names=all_names, constants=constants)
+            devices = known.beside(devices)
         names = few([f"'{name}'" for name in names])
         sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
         numbers = free * int(new.sum())
@@ -396,6 +391,14 @@ def check_joint_order(robot: Tree, data: Any) -> None:
         what = f"the measurements' joints are not those of robot '{robot.name}'"
         fix = joint_name_fix(robot, names)
         raise InputError.of(what, expected=listed(robot.joint_names), got=listed(names), fix=fix)
+
+
+def check_payload_link(link: str, data: Any) -> None:
+    """Raise MeasurementError for payloads at another link than that of a model's fit; "" for a model without."""
+    own = None if data.payload is None else data.payload_at
+    if link and own is not None and own != link:
+        fix = "leave these rows out, or calibrate with the payload there"
+        raise MeasurementError.of("the payload of the measurements", expected=f"at '{link}'", got=f"'{own}'", fix=fix)
 
 
 def joint_name_fix(robot: Tree, names: Sequence[str]) -> str:

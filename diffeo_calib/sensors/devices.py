@@ -209,6 +209,11 @@ class Devices(ABC):
         seen = cls.bodies(points)
         return cls.of(data, torch.stack([cls.start(data.values[own], seen[own]) for own in rows]))
 
+    def beside(self, other: Devices) -> Devices:
+        """These and others of the same kind under other names, such as wires with and without a known zero."""
+        names, constants = (*self.names, *other.names), torch.cat([self.constants, other.constants])
+        return replace(self, names=names, constants=constants)
+
     @property
     def freedom(self) -> int:
         """Increments of all devices."""

@@ -47,7 +47,7 @@ def errors_frame(errors: Any) -> Any:
     if errors.away is not None:
         columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=False))
     columns["error"] = errors.errors.flatten()
-    return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles})
+    return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles.flatten()})
 
 
 @dataclass(frozen=True)

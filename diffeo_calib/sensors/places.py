@@ -91,9 +91,21 @@ def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
     """
     names, own = sessions_of(data)
     predicted = predicted[:, : data.markers]
+    check_same_markers(predicted, data.points)
     rows = [(own == place).to(predicted.device) for place in range(len(names))]
     found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
     return SessionPlaces(names, torch.stack(found))
+
+
+def check_same_markers(points: Tensor, measured: Tensor) -> None:
+    """Raise InputError for points (N, P, 3) of other markers than those that were measured."""
+    if points.shape != measured.shape:
+        raise InputError.of(
+            "the model and the measurements do not have the same markers",
+            expected=f"predictions of shape {tuple(measured.shape)}",
+            got=tuple(points.shape),
+            fix="evaluate on the markers that the model was calibrated with, in the same order",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +252,7 @@ class Places:
 
 def sensor_key(data: Readings) -> object:
     """What readings of the same kind of devices have in common."""
-    return data.kind, data.offset_std, data.intrinsics
+    return data.column_kind
 
 
 def fitting_devices(data: Readings, points: Tensor) -> Devices:
@@ -301,6 +313,14 @@ class PlacedDevices:
         nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
         return cls(kind, names, constants, deviations, nothing, nothing, shown)
 
+    @classmethod
+    def of_model_alone(cls, names: tuple[str, ...], mounted: int) -> PlacedDevices:
+        """The only set-up, whose frame, or markers that were mounted anew (0: none were), are those of the model."""
+        none = torch.zeros(1, 3 * mounted, dtype=torch.float64, device=HOST)
+        if mounted:
+            return cls.outside(MOUNTING, names, none, none)
+        return cls.outside(SESSION, names, torch.eye(4, dtype=torch.float64, device=HOST).view(1, 16), none)
+
     def beside(self, other: PlacedDevices) -> PlacedDevices:
         """These, and those of the same kind with other names."""
         kept = [number for number, name in enumerate(other.names) if name not in self.names]
@@ -317,19 +337,31 @@ class PlacedDevices:
             self.shown or other.shown,
         )
 
-    def carried(self, T: Tensor, before: Tensor, after: Tensor) -> PlacedDevices:
+    def same_set(self, other: PlacedDevices) -> bool:
+        """Whether others are of one set with these: of the same kind, and under the same names if readings are."""
+        return self.kind == other.kind and (self.devices is None or bool(set(self.names) & set(other.names)))
+
+    @property
+    def of_model(self) -> bool:
+        """Whether this is one set-up alone, whose frame and markers are those of the model."""
+        return self.kind in (SESSION, MOUNTING) and len(self.names) == 1
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> PlacedDevices:
         """The same devices beside another model: those of readings read of its points what they read before.
 
         Args:
             T: (4, 4) from the old frame to the new one, m.
             before, after: (N, P, 3) points of the old and the new model at the rows of the fit, m.
+            markers: (P, 3) old places of the markers from the new ones, in the frames of their tips, m.
         """
         if self.kind == SESSION:
             moved = self.constants.view(-1, 4, 4) @ torch.linalg.inv(T)
             return replace(self, constants=moved.flatten(1))
         if self.kind == SOCKET:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
-        if self.devices is None:  # what is on the tool
+        if self.kind == MOUNTING:
+            return replace(self, constants=self.constants + markers.flatten()[: self.constants.shape[1]])
+        if self.devices is None:
             return self
         each = [_carried(self.devices, number, before, after) for number in range(len(self.names))]
         return replace(self, constants=torch.stack(each))
@@ -380,7 +412,7 @@ class PlacedDevices:
 
     @classmethod
     def from_entry(cls, entry: Any, rows: int) -> PlacedDevices:
-        """The inverse of :meth:`entry`, for a fit of so many rows.
+        """The inverse of :meth:`entry`, for a fit with this number of rows.
 
         Raises:
             InputError: entries that do not fit together.

@@ -66,7 +66,8 @@ class Outcome:
 
     def numbers(self, *labels: str) -> list[float]:
         """RMS, median, 95 % and maximum (of orientations, if there are any) in the table row that holds all labels."""
-        rows = [line.split("│") for line in self.out.splitlines() if all(label in line for label in labels)]
+        lines = [line for line in self.out.splitlines() if "│" in line and all(label in line for label in labels)]
+        rows = [line.split("│") for line in lines]
         assert len(rows) == 1, self.out
         numbers = [float(cell) for cell in rows[0][1:-1] if cell.strip().replace(".", "", 1).isdigit()]
         return numbers[-5:-1] if "expected RMS" in self.out else numbers[-4:]

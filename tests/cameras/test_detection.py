@@ -163,3 +163,27 @@ def test_images_without_rows_are_refused(folder: Path) -> None:
     table.write_text("image,q1\nmissing.png,2\n")
     with pytest.raises(MeasurementError, match=r"missing\.png"):
         read_folders([folder], table, FOUND)
+
+
+def test_a_dictionary_needs_no_prefix_and_an_unknown_one_is_named() -> None:
+    assert len(Board.of("charuco:5x7:0.04:0.03:5X5_100").points) == 24
+    with pytest.raises(InputError, match=r"DICT_4X4_100.*got.*4X4_10O"):
+        Board.of("charuco:5x7:0.04:0.03:4X4_10O")
+
+
+def test_folders_of_two_cameras_become_one_table(tmp_path: Path, command: Command) -> None:
+    seen = {"left": (0, 1, 2), "right": (1, 2, 3)}
+    for camera, numbers in seen.items():
+        (tmp_path / camera).mkdir()
+        for k in numbers:
+            cv2.imwrite(str(tmp_path / camera / f"{k}.png"), image(k))
+    (tmp_path / "joints.csv").write_text("image,q1\n" + "\n".join(f"{k}.png,{k}" for k in range(4)))
+    folders, out = (tmp_path / "left", tmp_path / "right"), tmp_path / "corners.csv"
+    done = command("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
+    assert done.code == 0, done.err
+    head, *lines = out.read_text().splitlines()
+    assert head.endswith("v,camera")
+    found = {(line.split(",")[0], line.split(",")[-1]) for line in lines}
+    assert found == {(f"{k}.png", camera) for camera, numbers in seen.items() for k in numbers}
+    assert (tmp_path / "left.yaml").is_file()
+    assert (tmp_path / "right.yaml").is_file()

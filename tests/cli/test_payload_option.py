@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_fit_takes_the_column(folder: Path, tmp_path: Path, command: Command) -> None:
     robot = ("--robot", folder / "arm.urdf", "--base", "base_link", "--tip", "flange")
     files = ("-o", tmp_path / "m.safetensors", "--report", tmp_path / "r.html")
-    done = command("fit", folder / "t.csv", *robot, *POSITION, *files, "--payload", "kg")
+    done = command("--verbose", "fit", folder / "t.csv", *robot, *POSITION, *files, "--payload", "kg")
     assert done.code == 0, done.err
     assert "payload" in done.out
     assert "payload" in (tmp_path / "r.html").read_text(encoding="utf-8")

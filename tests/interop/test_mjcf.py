@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +14,7 @@ import torch
 from export_bank import UGLY, UGLY_ENDS, configurations, own_poses, wrong
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.mjcf import mjcf_text, write_mjcf
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.joint import Joint
@@ -34,6 +36,13 @@ def tip_poses(model: mujoco.MjModel, chain: dc.Tree, q: torch.Tensor) -> torch.T
     return found
 
 
+def inertia(body: Any) -> np.ndarray:
+    """(3, 3) about the centre of mass, in the body's axes, kg m^2."""
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, body.iquat)
+    return R.reshape(3, 3) @ np.diag(body.inertia) @ R.reshape(3, 3).T
+
+
 @pytest.mark.parametrize("text", [UGLY, MIMIC], ids=["ugly", "mimic"])
 def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Path) -> None:
     (tmp_path / "before.urdf").write_text(text)
@@ -51,6 +60,10 @@ def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Pat
 def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> None:
     arm = SimulatedArm(seed=0)
     arm.write_urdf(tmp_path / "arm.urdf")
+    text = (tmp_path / "arm.urdf").read_text()
+    turned = re.sub(r'(<inertial>\s*<origin xyz="[^"]*")[^/]*/>', r'\1 rpy="0.3 -0.5 0.7"/>', text)
+    assert turned != text
+    (tmp_path / "arm.urdf").write_text(turned)
     chain = dc.load_urdf(tmp_path / "arm.urdf", "base_link", "flange")
     ours = mujoco.MjModel.from_xml_string(mjcf_text(wrong(chain)))
     theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.urdf"))
@@ -60,7 +73,7 @@ def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> Non
         assert here.name == there.name
         np.testing.assert_allclose(here.mass, there.mass)
         np.testing.assert_allclose(here.ipos, there.ipos, atol=1e-12)
-        np.testing.assert_allclose(sorted(here.inertia), sorted(there.inertia), rtol=1e-9)
+        np.testing.assert_allclose(inertia(here), inertia(there), rtol=0, atol=1e-9)
 
 
 def test_a_robot_without_a_urdf_has_bodies_named_after_joints() -> None:
@@ -77,3 +90,17 @@ def test_what_mjcf_cannot_hold_is_refused() -> None:
     arm = SimulatedArm(seed=0).nominal
     with pytest.raises(InputError, match="not above"):
         mjcf_text(wrong(arm.reversed()))
+    alone = replace(joints[0], name="d", mimic={"elsewhere": 1.0})
+    beside = Joint("elsewhere", "revolute", torch.eye(4, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"mimic joint 'd'.*elsewhere"):
+        mjcf_text(wrong(Chain("robot", "base", "tip", [*joints, alone], drivers=[beside])))
+
+
+@pytest.mark.parametrize(("old", "new"), [('ixx="', 'ixx="x'), ('<mass value="', '<mass value="x')])
+def test_inertias_that_are_no_numbers_are_named(old: str, new: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    SimulatedArm(seed=0).write_urdf(path)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(RobotError, match="<inertial> of link"):
+        mjcf_text(wrong(dc.load_urdf(path, "base_link", "flange")))

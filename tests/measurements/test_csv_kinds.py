@@ -37,9 +37,9 @@ def resting() -> dc.Measurements:
     return dc.Measurements.from_sockets(some(5, seed=2).q, names, NAMES, distances=known, distance_std=3e-5)
 
 
-def lengths(std: float | None = None, offset_std: float = 0.0) -> Readings:
+def lengths(std: float | None = None, offset_std: float = 0.0, names: str = "AB") -> Readings:
     q, seen = some(5, seed=3).q, values(5).abs() + 1.0
-    return Readings.distances(q, seen, ["A", "A", "B", "B", "A"], NAMES, std=std, offset_std=offset_std)
+    return Readings.distances(q, seen, [names[k] for k in (0, 0, 1, 1, 0)], NAMES, std=std, offset_std=offset_std)
 
 
 def heights() -> Readings:
@@ -78,7 +78,9 @@ KINDS: dict[str, Any] = {
     "images": images,
     "images on a tip": lambda: images(None).with_tips(["left"]),
     "poses and sockets": lambda: dc.Measurements.joined([poses(), resting()]),
-    "all": lambda: Observations.joined([positions(), lengths(), resting(), heights(), images(), lengths(1e-4, 0.1)]),
+    "all": lambda: Observations.joined(
+        [positions(), lengths(), resting(), heights(), images(), lengths(1e-4, 0.1, "CD")]
+    ),
     "all in sessions": lambda: Observations.joined([positions().with_sessions(list("uvuvu")), images(), resting()]),
     "laden": lambda: Observations.joined([poses(), heights()]).with_payload(torch.arange(9.0)),
 }

@@ -278,6 +278,19 @@ def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command
         assert sentence in out.read_text(encoding="utf-8").replace("\u00a0", " ")
 
 
+def test_rows_of_the_fit_are_not_held_against_a_tolerance(
+    files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case
+) -> None:
+    fitted = arm.train[:30].with_joint_names(arm.robot.joint_names)
+    write_measurements(tmp_path / "old.csv", fitted, TableFormat("mm", "deg"), position=("x", "y", "z"))
+    out, given = tmp_path / "report.html", ("--data", tmp_path / "old.csv", *POSITION)
+    done = command("report", files[0], "-o", out, *given, "--tolerance", "5mm")
+    assert done.code == 1
+    assert "--tolerance" in done.error
+    assert "30 that did" in done.error
+    assert not out.exists()
+
+
 def test_measured_positions_decide_about_a_tolerance() -> None:
     """The error that a model of several kinds expects of itself is below it; new rows are not."""
     kind = kind_named("mixture")

@@ -62,8 +62,12 @@ class CameraErrors(DeviceSet):
         """See :class:`DeviceSet`."""
         if other.coordinates is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
-        (shared,) = other.coordinates.table.shared_errors()
-        return replace(self, shared=shared, rows=other.coordinates.rows)
+        return replace(self.in_own_frame(other.coordinates.table), rows=other.coordinates.rows)
+
+    def in_own_frame(self, table: Measurements) -> Any:
+        """See :class:`DeviceSet`."""
+        (shared,) = table.shared_errors()
+        return replace(self, shared=shared)
 
     def placed(self) -> PlacedDevices | None:
         """Nothing."""

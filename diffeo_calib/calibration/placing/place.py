@@ -261,6 +261,7 @@ class Placed:
             for one in placement:
                 table = one.at_places(table)
             coordinates = coordinates._replace(table=table)
+            placement = Placement(tuple(one.in_own_frame(table) for one in placement))
         count = len(data if coordinates is None else coordinates.rows)
         tails = Tails.none(count, self.identification.tails.weights.shape[1])
         found = replace(self.identification, tails=tails)

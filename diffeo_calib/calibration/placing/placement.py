@@ -129,6 +129,10 @@ class DeviceSet(ABC):
         """Rows that tell coordinates where these devices put them."""
         return table
 
+    def in_own_frame(self, table: Any) -> Any:
+        """The same for rows that tell coordinates, brought into the frame of the model; see :meth:`with_rows`."""
+        return self
+
     @abstractmethod
     def placed(self) -> PlacedDevices | None:
         """What a model keeps of them; None for nothing."""

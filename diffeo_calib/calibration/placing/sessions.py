@@ -77,11 +77,11 @@ class Sessions(DeviceSet):
             MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
         """
         table = own.table
-        if len(table.session_names) < 2:
+        if len(table.present_sessions) < 2:
             return [], table
         if table.without_device:
             fix = "give the sockets of each session names of their own, and leave the sessions out"
-            got = few(table.session_names)
+            got = few(table.present_sessions)
             raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
         progress("sessions", 0, 1)
         rows = table.device_rows()
@@ -122,7 +122,7 @@ class Sessions(DeviceSet):
             own: rows of a table of ``count`` rows. device: those of them that a device measured.
             geometry: of the robot in the frame of the largest session. seen: (M, P, 3) their points there, m.
         """
-        if len(device.table.session_names) < 2:
+        if len(device.table.present_sessions) < 2:
             return [], own
         reference = reference_of(device.table)
         if device.table.remounted:

@@ -33,7 +33,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -157,6 +157,7 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
     check_joint_order(model.robot, new)
+    check_payload_link(model.nominal.load.link, new)
     model.robot.joint_values(new.q)
     model.nominal.load.under(new.payload).checked()
 

@@ -58,7 +58,7 @@ class ToolOnTip:
 
     @property
     def label(self) -> str:
-        """What the tool is called in messages."""
+        """Name of the tool in messages."""
         return "tool" if self.place is None else f"tool on {self.tip}"
 
 
@@ -98,7 +98,7 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
 
 
 def _check(options: Correction) -> None:
-    """Refuse options that say nothing."""
+    """Refuse options without effect."""
     if options.limit is not None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:

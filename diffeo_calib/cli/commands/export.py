@@ -219,7 +219,7 @@ def run(path: Path, given: Export) -> None:
 
 
 def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
-    """What the rows of the fit leave open, if rigid kinematics are written: base and tool are right only together."""
+    """Directions that the rows leave open, for rigid kinematics: their base and tool are right only together."""
     if rigid and (places := ExpectedError.of(model).open_places):
         yield (
             f"the rows of the fit leave {' and '.join(places)} open: base and tool of these files may both stand apart "
@@ -228,7 +228,7 @@ def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[s
 
 
 def _drift_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """What files that know no time or temperature hold of a drift."""
+    """How a drift enters files that know neither time nor temperature."""
     drift = KnownDrift.of(model)
     if drift is not None:
         yield from drift.sentences()

@@ -161,7 +161,7 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
 def _lines_about_places(
     result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: dict[str, HandEye]
 ) -> Iterator[str]:
-    """What was hidden, and where devices, base and markers, or camera and board, were found."""
+    """Hidden markers, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
     placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
     placement = list(hand_eye_sentences(hand_eye)) or placement

@@ -42,7 +42,7 @@ TRACKERS = {"tracker": Sensor.positions, "poses": Sensor.poses}
 
 
 def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
-    """What --sensor says; nothing if it was not given."""
+    """The sensors of --sensor; none if it was not given."""
     numbers: dict[str, list[list[float]]] = {}
     found = []
     for text in words or ():
@@ -103,7 +103,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
 
 
 def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
-    """What a model expects over the joint ranges of its fit, and why the plan says another number."""
+    """Expected error over the joint ranges of the fit, and why that of the plan differs."""
     if isinstance(source, CalibratedKinematics):
         yield "the table is of the poses drawn or given, perhaps beyond the fit's, and counts what its rows leave open"
         yield from expectation_lines(source, None)

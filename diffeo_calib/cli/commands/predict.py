@@ -165,7 +165,7 @@ class _Readings:
         return torch.cat(parts, 1)
 
     def sentences(self) -> Iterator[str]:
-        """What the columns are, and how wide 95 % regions are."""
+        """Meaning of the columns, and the width of 95 % regions."""
         for own in self.devices:
             numbers = own.mean.shape[1]
             widths = f"within {chi2_above(0.05, numbers) ** 0.5:.2f} standard deviations"

@@ -22,7 +22,7 @@ from diffeo_calib.kinematics.evaluation import warn_outside_range
 
 @dataclass(frozen=True)
 class Options:
-    """What may have moved, and what is kept with the model."""
+    """Assumptions about the set-up, and the note that is kept with the model."""
 
     marker: str
     drift: str
@@ -86,7 +86,7 @@ def _found(result: Recalibration) -> list[str]:
 
 
 def changes_entry(changes: Changes) -> list[dict[str, object]]:
-    """What has changed, for programs."""
+    """Changes for programs."""
     return [
         {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
         for one in changes.found
@@ -94,5 +94,5 @@ def changes_entry(changes: Changes) -> list[dict[str, object]]:
 
 
 def change_lines(changes: Changes) -> list[str]:
-    """What has changed, one line each."""
+    """Changes, one line each."""
     return [f"  {change}" for change in changes.found] or [str(changes)]

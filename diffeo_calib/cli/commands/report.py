@@ -12,7 +12,7 @@ from diffeo_calib.cli.options import Page
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
 from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.findings import Findings, unseen
 from diffeo_calib.reports.html import kinds, sentences
 from diffeo_calib.reports.report import judged, write_report
 
@@ -25,6 +25,9 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--tolerance {wanted.tolerance}", expected="a length, such as 0.15mm")
     tolerance = None if limit is None else limit.value
+    if tolerance is not None and data is not None and unseen(kinematics, data) is None:
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
+        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, output, data, **given, progress=progress)

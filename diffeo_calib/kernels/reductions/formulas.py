@@ -80,7 +80,7 @@ class Formula(ABC):
         """The pairwise scalars w_ij, computed by ``pairs`` as matrices or as lazy symbols."""
 
     def summands(self, j: Points) -> list[Tensor]:
-        """What every weight multiplies: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
+        """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
         return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded()]
 
     def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:

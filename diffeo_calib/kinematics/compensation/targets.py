@@ -1,4 +1,4 @@
-"""What a tool shall reach: poses, positions, or positions with the direction of one of its axes.
+"""Targets of a tool: poses, positions, or positions with the direction of one of its axes.
 
 With the tool at (p, R) and the target at (p*, R*), the miss that is made small is
 
@@ -225,7 +225,7 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, to
 
 
 def _parts(targets: Tensor, axis: object, tool_axis: str, place: Any) -> dict[str, Any]:
-    """What :class:`Targets` is made of, from finite poses (N, T, 4, 4) or positions (N, T, 3)."""
+    """The arguments of :class:`Targets`, from finite poses (N, T, 4, 4) or positions (N, T, 3)."""
     shape, flat = targets.shape[:2], targets.flatten(0, 1)
     if targets.ndim == 4:
         if axis is not None:

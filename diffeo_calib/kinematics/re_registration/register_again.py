@@ -82,7 +82,7 @@ def register_again(
 
 
 class FoundPlace(NamedTuple):
-    """What a registration found.
+    """Result of a registration.
 
     Args:
         registration: its record. odds: probability of each prior deviation of the markers, m.
@@ -151,12 +151,14 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
 
     Devices that the model knows and that have no rows stay where they are.
     """
-    found = {own.kind: own for own in model.placement}
+    found = list(model.placement)
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
         for own in sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach(), model.turns):
-            found[own.kind] = own.beside(found[own.kind]) if own.kind in found else own
-    return tuple(found.values())
+            same = next((number for number, old in enumerate(found) if own.same_set(old)), len(found))
+            alone = [] if own.of_model else [own]
+            found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
+    return tuple(found)
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
@@ -167,9 +169,12 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
     Args:
         old, new: the models, of the same points. T: (4, 4) from the frame of the old one to that of the new one, m.
     """
-    points = old(old.configurations).detach(), new(old.configurations).detach()
-    kept = [own for own in old.placement if own.kind != DRIFT]
-    return tuple(own.carried(T.to(HOST), *(each.to(HOST) for each in points)) for own in kept)
+    q, T = old.configurations, T.to(HOST)
+    before, after, turns = (each.detach().to(HOST) for each in (old(q), new(q), new.turns(q)))
+    P = min(before.shape[1], after.shape[1])
+    away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
+    markers = (turns[:, :P].mT @ away[..., None])[..., 0].mean(0)
+    return tuple(own.carried(T, before, after, markers) for own in old.placement if own.kind != DRIFT)
 
 
 def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:

@@ -53,7 +53,7 @@ from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What a registration found, and from what.
+    """Result of a registration, and the rows behind it.
 
     Args:
         transform: (4, 4) from the measuring frame before to the new one, m.
@@ -186,7 +186,7 @@ class RegisteredMap(FittedMap):
         return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT
 
     def _added(self, at: Linearisation, by_marker: Tensor | None) -> Tensor:
-        """What the registration adds to the covariance: (M, m', m')."""
+        """Covariance that the registration adds: (M, m', m')."""
         found, device = self.registration, self.deformation.x.device
         shape = at.sensitivity.shape[:2]
         points, centre = at.task[-1].points.view(shape[0], -1, 3), found.centre.to(device)

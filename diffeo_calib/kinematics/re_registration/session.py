@@ -1,4 +1,4 @@
-"""What a registration starts from: the rows as the fitted map sees them, and the markers before."""
+"""Start of a registration: the rows as the fitted map sees them, and the markers before."""
 
 from __future__ import annotations
 

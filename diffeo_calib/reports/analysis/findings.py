@@ -130,7 +130,7 @@ def find(
 
     Raises:
         InputError: arguments of another kind, joints in another order, or a column that the table does not have.
-        MeasurementError: errors that say nothing about the robot, or too few rows of a set-up.
+        MeasurementError: errors too large to describe the robot, or too few rows of a set-up.
     """
     check_arguments(model, data)
     if data is not None:
@@ -223,7 +223,7 @@ def _check_registered(model: CalibratedKinematics) -> None:
 def _repeats(
     rows: FitRows, model: CalibratedKinematics, data: Measurements | None, stages: Mapping[str, Kinematics]
 ) -> Repeats | None:
-    """What repeated configurations show, in the table or else in the rows of the fit."""
+    """Repeatability from repeated configurations, in the table or else in the rows of the fit."""
     noise = float(model.map.new_noise.diagonal().mean().sqrt())
     repeats = None if data is None else repeats_of(data, stages, noise)
     if repeats is None and model.registration is None and rows.known:

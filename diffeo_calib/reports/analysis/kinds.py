@@ -1,4 +1,4 @@
-"""What a report says about rows of any kinds: errors of each in its own unit, and the error to expect of positions."""
+"""Analysis of rows of any kinds: errors of each in its own unit, and the error to expect of positions."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class KindFindings:
 
     @property
     def rms_of(self) -> str:
-        """What it is of, in words."""
+        """Its source, in words."""
         return self.judged[1]
 
     @property

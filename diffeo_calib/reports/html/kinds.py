@@ -21,7 +21,7 @@ FLATTERING = {
 
 
 def rows_of(found: KindFindings) -> str:
-    """What the errors are of, in words."""
+    """Source of the errors, in words."""
     if not found.kinds:
         return "none, because no rows were passed"
     return f"{found.count} rows that the model has not seen" if found.new else f"{found.count} rows of its own fit"
@@ -43,7 +43,7 @@ def _by_kind(found: KindFindings) -> Iterator[str]:
 
 
 def advice(found: KindFindings) -> Iterator[str]:
-    """What to do next."""
+    """Advice on the next step."""
     for stages in found.kinds.values():
         *others, own = stages.values()
         if own.rms >= min(one.rms for one in others):
@@ -63,7 +63,7 @@ def figures(found: KindFindings) -> Iterator[tuple[str, str]]:
 
 
 def sections(found: KindFindings) -> Iterator[Section]:
-    """What the page shows before its record."""
+    """Contents of the page before its record."""
     yield _how_good(found)
     yield _expected(found)
     yield from devices(found.devices)
@@ -83,7 +83,7 @@ def _how_good(found: KindFindings) -> Section:
 
 
 def _expected(found: KindFindings) -> Section:
-    """What the model expects of its own positions."""
+    """Expected errors of the model's positions."""
     robot, free = found.model.robot, found.model.map.workspace is not None
     rows = [[name, millimetres(value)] for name, value in found.expected.items()]
     pictures = expected_pictures(robot, found.deviations, "Expected error against {}.")

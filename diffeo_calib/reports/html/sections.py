@@ -98,14 +98,14 @@ def expected_pictures(robot: Tree, expected: Deviations, label: str) -> list[Pic
 
 
 def parts_picture(parts: Sequence[Part]) -> Picture:
-    """What each part of a model explains."""
+    """Displacement explained by each part of a model."""
     left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in parts)
     frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
     return panel("parts", "What each part of the model explains (parts may cancel).", draw_parts, parts, frame=frame)
 
 
 def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
-    """What the page shows before its record."""
+    """Contents of the page before its record."""
     for number, section in enumerate(every := (how_good, where, why, trust, repeatability)):
         progress("drawing", number, len(every))
         yield section(found)
@@ -127,7 +127,7 @@ def how_good(found: Findings) -> Section:
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
-        "classical calibration. Calibrated: gravity sag, transmission errors and what is left as well."
+        "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
     ]
     if found.predictions.left_out:
         notes.append(
@@ -257,7 +257,7 @@ def trust(found: Findings) -> Section:
 
 
 def _certainty(found: Findings) -> Iterator[Picture]:
-    """What the model claims, and what it would claim with fewer rows."""
+    """Errors that the model expects, and those with fewer rows."""
     label = "Found against claimed shares of errors; on the diagonal the claims are true."
     yield panel("coverage", label, draw_coverage, found.predictions)
     if found.learning_curve:

@@ -1,4 +1,4 @@
-"""What a report says in sentences: the verdict, what to do next, where and whether the model can be believed."""
+"""Sentences of a report: the verdict, what to do next, where and whether the model can be believed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BAD_RATIO = 1.5
 
 
 def rows_of(found: Findings) -> str:
-    """What the errors of a report are of, in words."""
+    """Source of the errors of a report, in words."""
     count = len(found.predictions)
     if found.predictions.left_out:
         return f"{count} poses of the fit, each predicted by {'all' if found.rows.whole else 'hundreds of'} others"
@@ -66,7 +66,7 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
 
 
 def advice(found: Findings) -> Iterator[str]:
-    """What to do next, the most important first."""
+    """Next steps, the most important first."""
     yield from found.moved
     if found.outliers:
         wrong = {one.row for one in found.outliers}

@@ -71,7 +71,7 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
 
 
 def explained(model: CalibratedKinematics, title: str = "") -> Figure:
-    """What each part of the model explains: RMS displacement of the markers."""
+    """Displacement explained by each part of the model: RMS displacement of the markers."""
     found = parts(model)
     figure, (axes,) = panels(1, title=title)
     figure.set_size_inches(PART_WIDTH, 0.9 + 0.24 * len(found))

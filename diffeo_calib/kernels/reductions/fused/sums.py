@@ -325,7 +325,7 @@ def _numbers(tiles: tuple[int, ...]) -> Tensor:
 
 
 def _instructions(formula: Formula, profile: Profile) -> Hashable:
-    """What a formula does with a profile, whose numbers may come from anywhere and change at any time."""
+    """Compiled form of a formula with a profile, whose constants may change between calls."""
     code, sides = Code(Vector("double", 1), count()), (Points(*([f"%{side}{k}"] for k in range(4))) for side in "ij")
     weights = formula.weights(SymbolicPairs(code), profile, *sides)
     return (*code.lines, *((w.value, w.scale) for w in weights))

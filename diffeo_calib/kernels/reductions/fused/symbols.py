@@ -42,7 +42,7 @@ EXP2 = {
 }
 """Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16 and 3e-9."""
 EXPONENTS = {"double": (1023, 52, 64), "float": (127, 23, 32)}
-"""What the bits of an exponent have added, bits of the fraction, bits of a number."""
+"""Bias of the exponent, bits of the fraction, bits of a number."""
 
 
 @dataclass(frozen=True)
