@@ -157,13 +157,18 @@ class GeometryMap(NominalMap):
         parts = [by_error.flatten(1, 2)]
         if self.rigid:
             tool = self.geometry.slices["tool"]
-            parts = [parts[0][..., : tool.start], parts[0][..., tool] @ rigid_motions(self.geometry.tool).to(x.device)]
+            parts = [parts[0][..., : tool.start], parts[0][..., tool] @ self._rigid_tool().to(x.device)]
         if self.elasticity is not None:
             parts.append(self.elasticity.sensitivities(turned, self._by_twist(by_error)))
         if self.waves.size:
             joints = [joint for joint in self.waves.joints for _ in range(2)]
             parts.append(self._smooth_jacobian(turned, theta)[..., joints] * self.waves.columns(x)[:, None])
         return torch.cat(parts, dim=2)
+
+    def _rigid_tool(self) -> Tensor:
+        """Projection (3 P, 3 P) of shifts of the tool's points on those that move every frame as a rigid body."""
+        moves = rigid_motions(self.geometry.tool.flatten())
+        return torch.block_diag(*(moves @ moves.mT))
 
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
@@ -181,12 +186,11 @@ class GeometryMap(NominalMap):
 
 
 def rigid_motions(points: Tensor) -> Tensor:
-    """Projection (3 P, 3 P) of shifts of points (P, 3) on those that move every three of them as a rigid body."""
-    arms = points.unflatten(0, (-1, 3))
-    arms = arms - arms.mean(1, keepdim=True)
-    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:2], 3, 3)
-    moves, _ = torch.linalg.qr(torch.cat([eye, -skew(arms)], -1).flatten(1, 2))
-    return torch.block_diag(*(moves @ moves.mT))
+    """Orthonormal columns (..., B, 9, 6), all motions of every three of points (..., 9 B) as a rigid body."""
+    arms = points.unflatten(-1, (-1, 3, 3))
+    arms = arms - arms.mean(-2, keepdim=True)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape, 3)
+    return torch.linalg.qr(torch.cat([eye, -skew(arms)], -1).flatten(-3, -2)).Q
 
 
 def _all_zero(coefficients: Tensor) -> bool:

@@ -13,6 +13,7 @@ from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.measurements.poses import mark_jacobian
 
 OPEN_M = 1e-3
@@ -87,3 +88,14 @@ def test_rows_and_weights_are_those_of_the_numbers(posed: Setting) -> None:
     markers = built("two markers").tangent_data
     assert markers.told is markers
     assert markers.in_numbers(markers.y) is markers.y
+
+
+def test_what_bends_a_pose_is_no_turn_of_it(posed: Setting) -> None:
+    """However far the measured pose is turned against that of k0: else a column has the error of its own row in it."""
+    data = posed.tangent_data
+    rigid = rigid_motions(data.points)
+    bent = torch.eye(9, dtype=torch.float64) - (rigid @ rigid.mT)[:, 0]
+    assert data.basis is not None
+    assert float((data.basis.mT @ bent).abs().max()) > 1e-6
+    assert float(data.motions_in_numbers(bent).abs().max()) < 1e-12
+    assert_close(data.motions_in_numbers(rigid[:, 0]), data.basis.mT @ rigid[:, 0])

@@ -30,6 +30,7 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence
 from diffeo_calib.common.quantiles import chi2_median, chi2_probability
+from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.se3 import skew
@@ -91,8 +92,7 @@ class Cause(NamedTuple):
 
     def told_by(self, data: TangentData) -> Cause:
         """The same with effects on the numbers that the rows tell, of effects on all coordinates."""
-        basis = data.basis
-        return self if basis is None else self._replace(effects=basis.mT @ self.effects, basis=basis)
+        return self._replace(effects=data.motions_in_numbers(self.effects), basis=data.basis)
 
 
 class ChangePoint(NamedTuple):
@@ -199,7 +199,7 @@ def change_during(
     order, dense = numbers.argsort(), some.factorised(scales)
     usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
     excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
-    found = findings(causes, dense, some.target, order, excess=excess, limits=limits)
+    found = findings(causes, dense, some, order, excess=excess, limits=limits)
     found = [one for one in found if one.displacement > least]
     if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
         return None
@@ -274,21 +274,27 @@ def _as_good(one: Finding, best: Finding, limits: ChangeLimits) -> bool:
 def findings(
     causes: Iterable[Cause],
     dense: CholeskyRegression,
-    target: Tensor,
+    data: TangentData,
     order: Tensor,
     *,
     excess: float = 1.0,
     limits: ChangeLimits = LIMITS,
 ) -> list[Finding]:
-    """Every cause at its best change point, and drifting; ``excess`` divides the gains."""
-    found = []
+    """Every cause at its best change point, and drifting.
+
+    Gains are divided by ``excess``, or by the mean square of what the cause leaves unexplained where that is larger.
+    """
+    found, target = [], data.target
+    total, count = float((dense.mu(target) * target).sum()), max(data.coordinates, 1)
+
+    def judged(point: ChangePoint) -> ChangePoint:
+        return point._replace(gain=point.gain / max(excess, (total - point.gain) / count))
+
     for cause in causes:
         jump = find_change_point(cause.effects, dense, target, order, limits.fewest_rows)
-        columns = _from_row(cause.effects, order, jump.row)
-        found.append(Finding(cause, jump._replace(gain=jump.gain / excess), False, columns))
+        found.append(Finding(cause, judged(jump), False, _from_row(cause.effects, order, jump.row)))
         columns = evenly_growing(cause.effects, order)
-        drift = _drift(cause.effects, columns, dense, target)
-        found.append(Finding(cause, drift._replace(gain=drift.gain / excess), True, columns))
+        found.append(Finding(cause, judged(_drift(cause.effects, columns, dense, target)), True, columns))
     return found
 
 
@@ -340,6 +346,8 @@ def causes_of(data: TangentData) -> list[Cause]:
     """What may change of robot, tool and measuring frame, and its effects on all rows."""
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
     base, markers = _base_motions(points), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
+    if data.basis is not None:  # nothing bends a frame
+        markers = markers @ torch.block_diag(*rigid_motions(geometry.tool.flatten()).to(markers.device))
     if data.slopes is not None:
         base, markers = data.slopes @ base, data.slopes @ markers
     kinds = data.noise_model.row_kinds

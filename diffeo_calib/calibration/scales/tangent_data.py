@@ -22,7 +22,7 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
@@ -163,6 +163,17 @@ class TangentData:
     def blocks_in_numbers(self, blocks: Tensor) -> Tensor:
         """Covariances of all coordinates (N, m, m) as those of :attr:`told`: (N, r, r)."""
         return blocks if self.basis is None else self.basis.mT @ blocks @ self.basis
+
+    def motions_in_numbers(self, motions: Tensor) -> Tensor:
+        """Derivatives of all coordinates (N, m, U) in those of :attr:`told` (N, r, U), less what bends poses of k0.
+
+        What bends it would look like a turn where the measured pose is turned against k0: by the very error of the row.
+        """
+        if self.basis is None:
+            return motions
+        rigid = rigid_motions(self.points)
+        kept = rigid @ (rigid.mT @ motions.unflatten(1, (-1, rigid.shape[2])))
+        return self.basis.mT @ kept.flatten(1, 2)
 
     # --- parts and variants, which share the linearisation ---
 
