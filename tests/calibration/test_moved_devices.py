@@ -125,7 +125,7 @@ def told(arm: SimulatedArm, q: Tensor, points: Tensor, *, given: bool = True) ->
     return said(arm.nominal, dc.Measurements(q, points), given=given)
 
 
-def said(robot: dc.Chain, data: dc.Measurements, *, given: bool = True) -> str | None:
+def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | None:
     """The same of any rows."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
