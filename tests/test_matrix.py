@@ -46,6 +46,7 @@ WHAT = {
     "several kinds": {("errors", "m"), ("readings", "m"), ("readings", "px")},
     "laser beams": {("errors", "m"), ("readings", "m")},
     "inclinations": {("errors", "m"), ("readings", "mrad")},
+    "images and a tracker": {("errors", "m"), ("readings", "m")},
 }
 """What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
 SHOWN = {"m": "mm"}
@@ -270,7 +271,11 @@ def _(bench: Bench) -> None:
     for one in evaluations(own):
         entry = found["kinds"][one.kind]["all"]
         assert (entry["what"], entry["unit"]) == (one.what, one.shown[0])
-        if kind.name not in ("images of a board", "two cameras"):  # whose poses follow from all corners of a table
+        if kind.name not in (
+            "images of a board",
+            "two cameras",
+            "images and a tracker",
+        ):  # whose poses follow from all corners of a table
             assert entry["rms"] == pytest.approx(one.shown[1] * one.rms, rel=1e-3)
     if kind.name in POSITIONED or kind.name in WITH_POSES:
         assert found["errors"]["all"]["rows"] == len(kind.new)

@@ -3,11 +3,13 @@
     python benchmarks/real_robots/board_images.py --out board_images.json [--seeds 3] [--rendered]
 
 The simulated arm with a camera on its flange or a fixed one, corners with drawn errors, or rendered images in which
-OpenCV finds them (needs OpenCV; before 5 for its hand-eye methods). The print's errors are drawn from their prior, its
-scale is known to 2e-4. Fields: `case`, `seed`, `images`, `noise_px`, `method`; `true_mm`, RMS error of three points of
-the camera's pose (0.1 m) over 200 new configurations in which it sees the board, without noise, after a rigid fit;
-`coverage_95` of these points by the model's regions without rigid motions, `coverage_absolute` with them and without
-the fit; `expected_mm`, what the model expects of `true_mm`; `seconds`; `memory_mib`, the process's peak so far.
+OpenCV finds them (needs OpenCV; before 5 for its hand-eye methods). `--several`: pixels alone, of two fixed cameras
+that see the same board, half of the images each, and of a head that sees a board on its own hand. The print is
+drawn from its prior, its scale is known to 2e-4. Fields: `case`, `seed`, `images`, `noise_px`, `method`; `true_mm`,
+RMS error of three points of the camera's pose (0.1 m) over 200 new configurations in which it sees the board, without
+noise, after a rigid fit; `coverage_95` of these points by the model's regions without rigid motions,
+`coverage_absolute` with them and without the fit; `expected_mm`, what the model expects of `true_mm`; `seconds`;
+`memory_mib`, the process's peak so far.
 """
 
 from __future__ import annotations
@@ -16,13 +18,15 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+sys.path.insert(0, str(Path(__file__).parents[1] / "robustness"))
 
 import resource
 import time
 import warnings
 from argparse import Namespace
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import harness
 import numpy as np
@@ -38,8 +42,10 @@ from simulated_camera import (
     CameraArm,
     camera_arm,
     fixed_camera_arm,
+    images_of_both,
     seen_corners,
 )
+from simulated_head import SeeingHead
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -51,8 +57,20 @@ COLUMNS = ("case", "seed", "images", "noise_px", "method", "true_mm", "expected_
 COLUMNS = (*COLUMNS, "seconds", "memory_mib")
 
 
+class Rows(NamedTuple):
+    """A robot, its first images by their number and noise, and new configurations with their true points, m."""
+
+    robot: dc.Tree
+    images: Callable[[int, float], dc.Measurements]
+    new: Tensor
+    truth: Tensor
+
+
 def measure(plan: Namespace) -> Iterator[Record]:
     """A record for every case, seed, number of images, noise and method."""
+    if plan.several:
+        yield from _several(plan.seeds)
+        return
     cases = {"camera on the tool": camera_arm, "fixed camera": fixed_camera_arm}
     for seed in range(1, plan.seeds + 1):
         for case, make in cases.items():
@@ -65,6 +83,34 @@ def measure(plan: Namespace) -> Iterator[Record]:
                         rows = shown[:count]
                         for record in _judged(seen, corners, rows, case == "fixed camera"):
                             yield {**own, **record}
+
+
+def _several(seeds: int) -> Iterator[Record]:
+    """Two cameras, and head and hand, by pixels alone."""
+    for seed in range(1, seeds + 1):
+        for case, rows in {"two fixed cameras": _two_cameras(seed), "head and hand": _head(seed)}.items():
+            for noise_px in NOISES_PX:
+                for count in COUNTS:
+                    data = rows.images(count, noise_px)
+                    own = {"case": case, "seed": seed, "images": count, "noise_px": noise_px}
+                    if len(data) == count:
+                        yield {**own, **_pixels(rows.robot, lambda data=data: data, rows.new, rows.truth)}
+
+
+def _two_cameras(seed: int) -> Rows:
+    arms = [fixed_camera_arm(max(COUNTS) + TEST_ROWS, seed, seed, second=second) for second in (False, True)]
+    new = torch.cat([arm.q[-TEST_ROWS // 2 :] for arm in arms])
+    shown = [replace(arm, q=arm.q[:-TEST_ROWS], boards=arm.boards[:-TEST_ROWS]) for arm in arms]
+    images = lambda count, noise_px: images_of_both(shown, [count // 2] * 2, noise_px, 100 + seed)  # noqa: E731
+    return Rows(arms[0].arm.nominal, images, new, arms[0].arm.true_points(new))
+
+
+def _head(seed: int) -> Rows:
+    seen = SeeingHead.drawn(2 * max(COUNTS) + TEST_ROWS, seed)
+    shown, new = replace(seen, q=seen.q[:-TEST_ROWS]), seen.q[-TEST_ROWS:]
+    return Rows(
+        seen.robot, lambda count, noise_px: shown.images(count, noise_px, 100 + seed), new, seen.true_points(new)
+    )
 
 
 def _drawn(seen: CameraArm, noise_px: float, seed: int) -> tuple[Tensor, Tensor]:
@@ -101,18 +147,24 @@ def _judged(seen: CameraArm, corners: Tensor, rows: Tensor, fixed: bool) -> Iter
     known: dict[str, Any] = {"camera_on_tool": not fixed}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few rows
-        start = time.perf_counter()
-        size = WIDTH, HEIGHT
-        data = dc.Measurements.from_images(q, corners[rows], size, robot.joint_names, board=BOARD_PRIOR, **known)
-        model = dc.calibrate(robot, data).model
-        seconds = round(time.perf_counter() - start, 1)
-        memory = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-        yield {"method": "pixels", **_regions(model, new, truth), "seconds": seconds, "memory_mib": memory}
+        given: dict[str, Any] = {"camera": (WIDTH, HEIGHT), "joint_names": robot.joint_names, "board": BOARD_PRIOR}
+        yield _pixels(robot, lambda: dc.Measurements.from_images(q, corners[rows], **given, **known), new, truth)
         boards = opencv_poses(corners[rows])
         poses = dc.Measurements.from_poses(q, boards, robot.joint_names, **known)
         yield {"method": "poses of boards", **_regions(dc.calibrate(robot, poses).model, new, truth)}
         for name, points in peers(robot, poses, boards, fixed=fixed):
             yield {"method": name, "true_mm": round(1e3 * rigid_rms(points(new), truth), 4)}
+
+
+def _pixels(robot: dc.Tree, images: Callable[[], dc.Measurements], new: Tensor, truth: Tensor) -> Record:
+    """What a model of images makes of new configurations."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few rows
+        start = time.perf_counter()
+        model = dc.calibrate(robot, images()).model
+        seconds = round(time.perf_counter() - start, 1)
+    memory = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    return {"method": "pixels", **_regions(model, new, truth), "seconds": seconds, "memory_mib": memory}
 
 
 def _regions(model: dc.CalibratedKinematics, new: Tensor, truth: Tensor) -> Record:
@@ -159,6 +211,8 @@ def arguments() -> Namespace:
     parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="simulated arms")
     parser.add_argument("--rendered", action="store_true", help="render the images, and find the corners by OpenCV")
+    text = "two fixed cameras, and head and hand"
+    parser.add_argument("--several", action="store_true", help=text)
     plan = parser.parse_args()
     plan.seeds = 1 if plan.quick else plan.seeds
     return plan

@@ -97,9 +97,9 @@ class SeeingHead:
         """True poses (N, 4, 4) of the board in the camera's frame, m."""
         return poses_from_marks(self.true_points(q), LEVER)
 
-    def images(self, count: int, noise_px: float) -> dc.Measurements:
+    def images(self, count: int, noise_px: float, seed: int = 7) -> dc.Measurements:
         """The first images that show enough corners."""
-        corners = seen_corners(self.boards(self.q), noise_px, 7, self.camera)
+        corners = seen_corners(self.boards(self.q), noise_px, seed, self.camera)
         shown = ((~corners[..., 3].isnan()).sum(1) >= FEWEST_SEEN).nonzero()[:count, 0]
         known = {"camera_on_tool": False, "board": BOARD_PRIOR}
         names = self.robot.joint_names

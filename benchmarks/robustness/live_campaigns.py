@@ -1,11 +1,12 @@
 """Does a campaign that watches itself name what goes wrong, and leave right rows alone? On simulated arms.
 
-    python benchmarks/robustness/live_campaigns.py --seeds 100 --out live_campaigns.json
+    python benchmarks/robustness/live_campaigns.py --seeds 33 --first 500 --out live_campaigns.json
+    python benchmarks/robustness/live_campaigns.py --seeds 67 --first 533 --clean --out clean_campaigns.json
 
 A campaign of 100 rows of one marker, or two for odd seeds, drawn at random, 0.02 mm of noise. At a random row from 40
 to 90 it is copied, and the copies go on with one fault each: the device is 0.3 mm away in a random direction, marker 0
 has slipped by 0.3 mm on the flange, the offset of one joint (of each) has changed by 0.5 mrad, the row's unit is mm as
-m, the two markers are exchanged.
+m, the two markers are exchanged. With `--clean` there are no faults.
 
 Fields of a record: `case`, `seed`, `row` of the fault, `rows` after it until the fault is named (1: at once; none:
 never among the rows that it has), `named`: what was named; `wrongly`: what was named before without the fault, if
@@ -73,14 +74,14 @@ def named(campaign: dc.Campaign, q: Tensor, y: Tensor, words: str) -> tuple[int 
     return None, text, wrongly
 
 
-def campaigns(seed: int) -> Iterator[Record]:
-    """One campaign without fault, and its copies with one each."""
+def campaigns(seed: int, clean: bool) -> Iterator[Record]:
+    """One campaign without fault and, unless all shall be clean, its copies with one each."""
     rng, arm = np.random.default_rng(seed), SimulatedArm(seed, markers=1 + seed % 2)
     q, y = arm.measure(ROWS, seed=seed + 1000)
     at, times, wrong = int(rng.integers(FIRST, LAST)), [], []
     campaign = dc.Campaign(arm.nominal, target=arm.sample(200, seed=seed + 2000))
     for row in range(ROWS):
-        if row == at:
+        if row == at and not clean:
             for case, words, faulty in faults(arm, rng, q[at:], y[at:]):
                 most = slice(0, WITHIN[case])
                 rows, text, wrongly = named(copy.deepcopy(campaign), q[at:][most], faulty[most], words)
@@ -109,7 +110,8 @@ if __name__ == "__main__":
     parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=harness.count, default=100, help="number of arms")
     parser.add_argument("--first", type=int, default=0, help="the first of them")
+    parser.add_argument("--clean", action="store_true", help="no faults")
     given = parser.parse_args()
     seeds = range(given.first, given.first + (1 if given.quick else given.seeds))
-    found = (one for seed in seeds for one in campaigns(seed))
+    found = (one for seed in seeds for one in campaigns(seed, given.clean))
     harness.guarded(partial(harness.report, found, given.out, COLUMNS))  # pyright: ignore[reportArgumentType]

@@ -126,7 +126,7 @@ class Camera:
         bends = ", ".join(f"{size * value[k + 2 + i]:.2f} +- {size * std[k + 2 + i]:.2f}" for i in range(3))
         return (
             f"board: scale {1e6 * value[k]:+.0f} +- {1e6 * std[k]:.0f} ppm, x against y {2e6 * value[k + 1]:+.0f} +- "
-            f"{2e6 * std[k + 1]:.0f} ppm, bent {bends} mm; lengths are the board's"
+            f"{2e6 * std[k + 1]:.0f} ppm, bent {bends} mm; lengths in the images are the board's"
         )
 
     def held(self) -> Camera:

@@ -159,7 +159,7 @@ class CampaignModel:
     def known(self, size: int | None = None) -> Tensor:
         """Covariance of the target and then of the candidates by all accepted rows, the first ``size`` numbers, m^2."""
         whole, mine = self.posterior.known[:size, :size], self.taken[self.last.rows.owner]
-        cross = self.posterior.between(self.last)[mine, :size]
+        cross = self.last.asked[mine, :size]
         return whole - cross.T @ torch.linalg.solve(self.last.covariance[mine][:, mine], cross)
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
@@ -178,9 +178,10 @@ class CampaignModel:
         except DiffeoCalibError:
             self.window.pop()
             raise
-        rows, last = Rows.of(around.data, self.scales), len(self.window) - 1
-        new = self.posterior.see(rows.rows(torch.tensor([last], dtype=torch.int64, device=HOST)))
-        seen = self.posterior.see(rows, torch.cat([self.last.white, new.white], 1))
+        last = len(self.window) - 1
+        seen = Seen.joined(
+            self.last, self._seen(around.data.rows(torch.tensor([last], dtype=torch.int64, device=HOST)))
+        )
         known = _flags([*(verdicts[number].accepted for number in self.window[:-1]), False])
         found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
         fits = found.fits(typical)
@@ -213,13 +214,10 @@ class CampaignModel:
         self.last = seen
         if len(self.window) <= LIMITS.window:
             return
-        owner, index = seen.rows.owner, torch.arange(len(seen.rows), device=HOST)
-        row, self.last = (
-            Seen(seen.rows.rows(some), seen.white[:, mine], seen.error[mine], seen.covariance[mine][:, mine])
-            for some, mine in ((index[:1], owner == 0), (index[1:], owner > 0))
-        )
+        index = torch.arange(len(seen.rows), device=HOST)
+        row, self.last = seen.some(index[:1]), seen.some(index[1:])
         if bool(self.taken[0]):
-            self.last = self.posterior.see(self.last.rows, self.posterior.take(row, self.last))
+            self.last = self.posterior.take(row, self.last)
         self.window, self.taken = self.window[1:], self.taken[1:]
 
     def _change(
@@ -258,17 +256,19 @@ class CampaignModel:
         """The last rows with other joint values of the last one, in words."""
         turning = torch.tensor(self.placed.registration.geometry.chain.periodic, dtype=torch.bool, device=HOST)
         q = table.q[row]
-        readings = (
-            ("its joint values seem to be degrees as radians", torch.where(turning, q * pi / 180, q)),
-            ("its joint values seem to be converted to radians twice", torch.where(turning, q * 180 / pi, q)),
-            ("it seems to have been measured at the joint values of the row before", table.q[row - 1]),
-        )
-        before = torch.arange(len(seen.rows) - 1, device=HOST)
-        white = seen.white[:, seen.rows.owner < len(before)]
-        for words, joints in readings:
-            new = self.posterior.see(Rows.of(self.around(table, [row], joints[None]).data, self.scales))
-            rows = Rows.joined(seen.rows.rows(before), new.rows)
-            yield words, self.posterior.see(rows, torch.cat([white, new.white], 1))
+        joints = {
+            "its joint values seem to be degrees as radians": torch.where(turning, q * pi / 180, q),
+            "its joint values seem to be converted to radians twice": torch.where(turning, q * 180 / pi, q),
+            "it seems to have been measured at the joint values of the row before": table.q[row - 1],
+        }
+        before = seen.some(torch.arange(len(seen.rows) - 1, device=HOST))
+        each = self._seen(self.around(table, [row] * len(joints), torch.stack([*joints.values()])).data)
+        for number, text in enumerate(joints):
+            yield text, Seen.joined(before, each.some(torch.tensor([number], dtype=torch.int64, device=HOST)))
+
+    def _seen(self, data: TangentData) -> Seen:
+        """Rows as the posterior predicts them."""
+        return self.posterior.see(Rows.of(data, self.scales))
 
     def around(self, table: Any, numbers: Sequence[int], joints: Tensor | None = None) -> Around:
         """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know.

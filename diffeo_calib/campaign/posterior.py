@@ -86,12 +86,74 @@ class Seen(NamedTuple):
 
     Args:
         rows: they. white: V (S, R). error: (R,) measured minus predicted, m. covariance: (R, R) with noise, m^2.
+        asked: (R, Z) covariance with the places asked, m^2.
     """
 
     rows: Rows
     white: Tensor
     error: Tensor
     covariance: Tensor
+    asked: Tensor
+
+    @classmethod
+    def joined(cls, first: Seen, second: Seen) -> Seen:
+        """Two groups seen by the same rows, in order."""
+        cross = first.covariance_with(second)
+        covariance = torch.cat(
+            [torch.cat([first.covariance, cross], 1), torch.cat([cross.T, second.covariance], 1)],
+        )
+        return cls(
+            Rows.joined(first.rows, second.rows),
+            torch.cat([first.white, second.white], 1),
+            torch.cat([first.error, second.error]),
+            covariance,
+            torch.cat([first.asked, second.asked]),
+        )
+
+    def covariance_with(self, other: Seen) -> Tensor:
+        """Covariance (R, R') with other rows, m^2."""
+        return self.rows.covariance(other.rows) - self.white.T @ other.white
+
+    def some(self, index: Tensor) -> Seen:
+        """Some of the rows, in order."""
+        mine = torch.isin(self.rows.owner, index)
+        return Seen(
+            self.rows.rows(index),
+            self.white[:, mine],
+            self.error[mine],
+            self.covariance[mine][:, mine],
+            self.asked[mine],
+        )
+
+
+class Factor:
+    """L of the covariance L L^T of the accepted rows, to which rows are appended: L = (low, 0; below, corner).
+
+    The solver copies what is not contiguous: `low` (n, n) is, and is never copied.
+    """
+
+    def __init__(self, covariance: Tensor) -> None:
+        self._low, self._count = cholesky(covariance), 0
+        self._appended = covariance.new_zeros(0, len(covariance))  # (room, n + room): below and corner
+
+    def solved(self, values: Tensor) -> Tensor:
+        """L^-1 values (S, R)."""
+        n, k = len(self._low), self._count
+        top = torch.linalg.solve_triangular(self._low, values[:n], upper=False)
+        if not k:
+            return top
+        rest = values[n:] - self._appended[:k, :n] @ top
+        return torch.cat([top, torch.linalg.solve_triangular(self._appended[:k, n : n + k], rest, upper=False)])
+
+    def append(self, white: Tensor, low: Tensor) -> None:
+        """Append R rows: V (S, R), and the factor (R, R) of their covariance by those before."""
+        n, k, size = len(self._low), self._count, len(white)
+        self._count += len(low)
+        if self._count > len(self._appended):
+            old, self._appended = self._appended, low.new_zeros(2 * self._count, n + 2 * self._count)
+            self._appended[: len(old), : old.shape[1]] = old
+        self._appended[k : self._count, :size] = white.T
+        self._appended[k : self._count, size : size + len(low)] = low
 
 
 class Posterior:
@@ -106,53 +168,66 @@ class Posterior:
 
     def __init__(self, rows: Rows, asked: Sequence[Rows]) -> None:
         self.rows, self.asked = rows, asked
-        self._factor = _cholesky(rows.covariance(rows) + rows.noises)
-        self._size = len(self._factor)
-        self._values = self._solved(rows.values[:, None])[:, 0]
-        self._of_asked = self._solved(self._with_asked(rows))
-        self.known = torch.cat([self._with_asked(one) for one in asked]) - self._of_asked.T @ self._of_asked
+        self._factor = Factor(rows.covariance(rows) + rows.noises)
+        self._values = self._factor.solved(rows.values[:, None])[:, 0]
+        self._of_asked = Growing(self._factor.solved(self._with_asked(rows)))
+        self.known = torch.cat([self._with_asked(one) for one in asked]) - self._of_asked.rows.T @ self._of_asked.rows
 
-    def see(self, rows: Rows, white: Tensor | None = None) -> Seen:
-        """Rows as they are predicted; ``white``: V if it is known."""
-        V = self._solved(self.rows.covariance(rows)) if white is None else white
-        return Seen(rows, V, rows.values - V.T @ self._values, rows.covariance(rows) + rows.noises - V.T @ V)
+    def see(self, rows: Rows) -> Seen:
+        """Rows as they are predicted."""
+        V = self._factor.solved(self.rows.covariance(rows))
+        covariance = rows.covariance(rows) + rows.noises - V.T @ V
+        asked = self._with_asked(rows) - V.T @ self._of_asked.rows
+        return Seen(rows, V, rows.values - V.T @ self._values, covariance, asked)
 
-    def between(self, seen: Seen) -> Tensor:
-        """Covariance (R, Z) of rows and the places asked, m^2."""
-        return self._with_asked(seen.rows) - seen.white.T @ self._of_asked
-
-    def take(self, seen: Seen, later: Seen) -> Tensor:
-        """Take rows in; returns V of later rows afterwards."""
-        low, cross = _cholesky(seen.covariance), seen.rows.covariance(later.rows) - seen.white.T @ later.white
-        asked, added, size = self.between(seen), len(low), self._size
-        of_asked = torch.linalg.solve_triangular(low, asked, upper=False)
-        values = torch.linalg.solve_triangular(low, seen.error[:, None], upper=False)[:, 0]
-        self._make_room(size + added)
-        self._factor[size : size + added, :size] = seen.white.T
-        self._factor[size : size + added, size : size + added] = low
-        self._size += added
-        self._values = torch.cat([self._values, values])
-        self._of_asked = torch.cat([self._of_asked, of_asked])
-        self.known = self.known - of_asked.T @ of_asked
+    def take(self, seen: Seen, later: Seen) -> Seen:
+        """Take rows in; returns later rows as they are predicted afterwards."""
+        low = cholesky(seen.covariance)
+        cross, asked, values = (
+            torch.linalg.solve_triangular(low, part, upper=False)
+            for part in (seen.covariance_with(later), seen.asked, seen.error[:, None])
+        )
+        self._factor.append(seen.white, low)
+        self._values = torch.cat([self._values, values[:, 0]])
+        self._of_asked.append(asked)
+        self.known = self.known - asked.T @ asked
         self.rows = Rows.joined(self.rows, seen.rows)
-        return torch.cat([later.white, torch.linalg.solve_triangular(low, cross, upper=False)])
+        return Seen(
+            later.rows,
+            torch.cat([later.white, cross]),
+            later.error - cross.T @ values[:, 0],
+            later.covariance - cross.T @ cross,
+            later.asked - cross.T @ asked,
+        )
 
     def _with_asked(self, rows: Rows) -> Tensor:
         """Prior covariance (R, Z) with the places asked, m^2."""
         return torch.cat([rows.covariance(one) for one in self.asked], 1)
 
-    def _solved(self, values: Tensor) -> Tensor:
-        factor = self._factor[: self._size, : self._size]
-        return torch.linalg.solve_triangular(factor, values, upper=False)
 
-    def _make_room(self, size: int) -> None:
-        if size > len(self._factor):
-            whole = self._factor.new_zeros(2 * size, 2 * size)
-            whole[: self._size, : self._size] = self._factor[: self._size, : self._size]
-            self._factor = whole
+class Growing:
+    """Rows of a matrix to which others are appended, mostly without a copy."""
+
+    def __init__(self, rows: Tensor) -> None:
+        self._room, self._count = rows, 0
+        self.append(rows)
+
+    @property
+    def rows(self) -> Tensor:
+        """(S, Z) all of them."""
+        return self._room[: self._count]
+
+    def append(self, rows: Tensor) -> None:
+        """Append some (R, Z)."""
+        start, self._count = self._count, self._count + len(rows)
+        if self._count > len(self._room) or not start:
+            old, self._room = self._room, rows.new_empty(2 * self._count, rows.shape[1])
+            self._room[:start] = old[:start]
+        self._room[start : self._count] = rows
 
 
-def _cholesky(matrix: Tensor) -> Tensor:
+def cholesky(matrix: Tensor) -> Tensor:
+    """The lower factor; NumericalError unless a covariance is positive definite."""
     factor, info = torch.linalg.cholesky_ex(0.5 * (matrix + matrix.T))
     if int(info):
         raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)

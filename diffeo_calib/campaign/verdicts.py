@@ -192,19 +192,21 @@ def find_change(
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
         single: the distance of the last row. typical: see :meth:`Measure.fits`.
     """
+    if not causes:
+        return None
     known, doubted = flags
-    owner, visible, found = seen.rows.owner, seen.rows.visible.flatten(), []
+    owner, found, sizes = seen.rows.owner, [], [cause.effects.shape[2] for cause in causes]
+    effects = torch.cat([cause.effects for cause in causes], 2).flatten(0, 1)[seen.rows.visible.flatten()]
     for first in range(len(numbers) - limits.fewest_rows + 1):
         after = (owner >= first) & doubted[owner]
         part = given(seen.error, seen.covariance, after, (owner < first) & known[owner])
-        low = torch.linalg.cholesky(part.covariance)
-        white = torch.linalg.solve_triangular(low, part.error[:, None], upper=False)[:, 0]
-        for cause in causes:
-            B = cause.effects.flatten(0, 1)[visible][after]
+        low, whole = torch.linalg.cholesky(part.covariance), torch.cat([part.error[:, None], effects[after]], 1)
+        error, *each = torch.linalg.solve_triangular(low, whole, upper=False).split([1, *sizes], 1)
+        white = error[:, 0]
+        for cause, B, columns in zip(causes, effects[after].split(sizes, 1), each, strict=True):
             spare = len(white) - B.shape[1]
             if spare < limits.spare:
                 continue
-            columns = torch.linalg.solve_triangular(low, B, upper=False)
             u = torch.linalg.lstsq(columns, white, driver="gelsd").solution
             fit = columns @ u
             gain, left = float(fit.square().sum()) / typical, float((white - fit).square().sum()) / typical

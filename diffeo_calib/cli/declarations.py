@@ -12,6 +12,7 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
+from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
@@ -65,7 +66,7 @@ def campaign_command(
     robot: options.Robot,
     units: options.Units,
     rows: options.Rows,
-    given: options.LiveOptions,
+    given: LiveOptions,
 ) -> None:
     """Judge rows while they are measured.
 
@@ -76,7 +77,12 @@ def campaign_command(
     A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
     options, the required ones too; those that are typed as well win.
     """
-    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot}, may_come="CSV")
+    bag = {} if given.bag is None else {"--bag": given.bag}
+    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot, **bag}, may_come="CSV")
+    if (given.bag is None) != (given.seen is None):
+        raise InputError.of("--bag and --seen belong together", fix="name both, or none")
+    if given.bag is not None and (given.once or given.stdin):
+        raise InputError.of("--once and --stdin beside --bag, whose end is that of the campaign", fix="leave them out")
     from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
@@ -89,7 +95,9 @@ def record_command(
     bag: Annotated[Path, typer.Argument(metavar="BAG", help="Folder of a ROS 2 bag.")],
     seen: Annotated[
         str,
-        typer.Option("--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured."),
+        typer.Option(
+            "--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured; or images."
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table to write.")],
     joints: Annotated[str, typer.Option("--joints", metavar="TOPIC", help="Joint states.")] = "/joint_states",
@@ -97,7 +105,10 @@ def record_command(
     shortest: Annotated[float, typer.Option("--shortest", min=0.01, help="Shortest stop in seconds.")] = 0.5,
     offset: Annotated[
         float | None,
-        typer.Option("--offset", help="Seconds to add to the times of --seen; by default estimated from all motions."),
+        typer.Option(
+            "--offset",
+            help="Seconds to add to the times of --seen; by default estimated from all motions, 0 for images.",
+        ),
     ] = None,
 ) -> None:
     """Turn a ROS 2 bag into a table, one row for each stop.
@@ -105,6 +116,9 @@ def record_command(
     A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
     standard deviations of what was seen (std_x, ...), its time and the number of readings. The clocks of both may
     differ. Needs the package rosbags.
+
+    Of images, the one nearest to the middle of each stop is written beside the table, which then has its name and the
+    joint values for `images`.
     """
     check_outputs({"-o": output}, {})
     from diffeo_calib.cli.commands import record  # noqa: PLC0415

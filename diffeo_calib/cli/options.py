@@ -278,30 +278,6 @@ class FitOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveOptions:
-    """How to follow a campaign."""
-
-    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
-    stdin: bool = option(
-        "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
-    )
-    listen: str | None = option(
-        "Take the same lines from a socket of this machine, 0 for any free port, and answer each: "
-        "campaign/feeds.py describes them. Addresses of other machines need --token.",
-        "[HOST:]PORT",
-    )
-    token: str = option("What a program must send first to --listen.", "TEXT", default="")
-    json_lines: bool = option(
-        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
-    )
-    once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
-    candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
-    page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
-    next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
-    accepted: Path | None = option("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
-
-
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
     """Uses of the errors of a model."""
 

@@ -139,20 +139,19 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
 def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
     """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
     header, rows = read_cells(csv, sheet.sep)
-    if alone and {IMAGE, *POINT, *PIXEL} <= set(header):
-        return _corners_in(csv, sheet)
-    found = guess_readings(columns)
-    if alone and len(found) == 1:
+    corners = _corners_in(csv, sheet) if {IMAGE, *POINT, *PIXEL} <= set(header) else []
+    found = guess_readings([name for name in columns if not corners or name not in (*POINT, *PIXEL)])
+    if alone and len(found) == 1 and not corners:
         return list(found)
     empty = {name for k, name in enumerate(header) if any(not cells[k].strip() for _, cells in rows)}
-    return [text for text, own in found.items() if set(own) <= empty]
+    return [*corners, *(text for text, own in found.items() if set(own) <= empty)]
 
 
 def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
     """The files of the cameras that `images` has written beside the table, else the size of the images."""
     header, rows = read_cells(csv, sheet.sep)
     names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
-    files = [f"{name}.yaml" for name in names]
+    files = [f"{name}.yaml" for name in names if name]
     if len(files) > 1 and all((csv.parent / file).is_file() for file in files):
         return [f"{CORNERS}{csv.parent / file}" for file in files]
     return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]

@@ -41,7 +41,6 @@ TELLING_ROWS, TELLING_MOTION = 10, 0.25
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
-COORDINATES = 3
 MOST_EXPECTED = 100
 """Rows from which the typical expected error is found."""
 
@@ -196,17 +195,12 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
 def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     """How many of the configurations (N, n) were fitted in another session than that of the model's measuring frame.
 
-    Markers of such rows share shifts in the noise of the fit, which those of the model's own session do not. All rows
-    of a registered model are in other frames: none is counted.
+    All rows of a registered model are in other frames, and models of old files do not know: none is counted.
     """
     if model.registration is not None:
         return 0
-    measured = COORDINATES * (model.markers - model.ball)  # what the ball's share are places of its sockets
-    shared, drift = model.map.noise.shared[:, :measured], KnownDrift.of(model)
-    shared = shared if drift is None else shared[..., : -drift.sizes.numel()]  # which all rows share
-    if not shared[:1].numel() or len(shared) != len(model.configurations):
-        return 0
-    elsewhere = model.configurations[(shared != 0).any(2).any(1)]
+    rows = [own.rows_elsewhere.to(q.device) for own in model.placement]
+    elsewhere = model.configurations[torch.cat(rows)] if rows else model.configurations[:0]
     return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 
 

@@ -318,7 +318,10 @@ def _observations(pieces: Sequence[_Piece]) -> Observations:
     """The pieces as observations, those of the same kind as one part."""
     _check_joinable([piece.table for piece in pieces])
     groups: dict[object, list[_Piece]] = {}
-    for pure in (_Piece(*pure) for piece in pieces for pure in unmixed(*piece)):
+    whole = [_Piece(*pure) for piece in pieces for pure in unmixed(*piece)]
+    if any("corners" in piece.table.columns for piece in whole):
+        whole = [_Piece(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
+    for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
     parts = [_in_one([piece.table for piece in group]) for group in groups.values()]
     return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])

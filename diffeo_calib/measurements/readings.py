@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, as_written
+from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     chosen_rows,
@@ -344,3 +344,31 @@ def _doubted(data: Readings, doubt: bool) -> Readings:
     if doubt:
         data.warn_if_suspicious()
     return data
+
+
+MARKER, CONTACT = "marker", "contact"
+"""Kinds of readings of points of a tool whose poses are measured."""
+
+
+def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
+    """Positions of markers, or a ball in sockets, as readings, see sensors/beside_poses.py, with their rows (M,).
+
+    Every marker of every set-up is that of a device of its own, as is every socket; distances of sockets are not used.
+    """
+    resting = table.sockets is not None
+    if resting and table.sockets.distances:
+        fix = "calibrate without the images to use them"
+        warn_user(sentence("known distances between sockets are not used beside images of a board", fix=fix))
+    found = []
+    for marker, name in enumerate(table.marker_names or range(1, table.markers + 1)):
+        rows = torch.arange(len(table), device=HOST) if resting else table.visible[:, marker].nonzero()[:, 0].cpu()
+        own = table.rows(rows)
+        of_marker = f" {name}" if table.markers > 1 else ""
+        names = own.row_sockets if resting else [f"{device or 'tracker'}{of_marker}" for device in own.device_names]
+        values = torch.zeros_like(own.points[:, marker]) if resting else own.points[:, marker]
+        std = None if own.std is None else own.std[:, marker]
+        kind = CONTACT if resting else MARKER
+        read = Readings.of(kind, own.q, values, names, own.joint_names, std=std, doubt=False, numbers=3)
+        alike = ("payload", "payload_at", "covariates", "covariate_names", "line_numbers", "file_sha256", "origin")
+        found.append((with_attributes(read, **{name: getattr(own, name) for name in alike}), rows))
+    return found

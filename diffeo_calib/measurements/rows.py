@@ -332,6 +332,10 @@ class RowTable(RowGroups):
     def __iter__(self) -> Iterator[Self]:
         return (self.rows(i) for i in range(len(self)))
 
+    def beside_images(self) -> list[tuple[Any, Tensor]]:
+        """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
+        return [(self, *self.index)]
+
     def rows(self, index: object) -> Self:
         """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
 

@@ -2,12 +2,13 @@
 
 A recording stands still where no value changes by more than a tolerance within a window around it. The clocks differ by
 the shift with which both stand still and move at the same times most often. A stop lasts as long as both stand still,
-without half a window at either end; its row is the mean over it.
+without half a window at either end; its row is the mean over it. Of images, whose motion nobody looks at, a stop of the
+joints takes the one nearest to its middle: clocks that differ by less than half a stop do no harm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ import numpy as np
 from diffeo_calib.common.errors import MeasurementError
 
 Array = np.ndarray
+PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+"""Columns of a place and a rotation."""
 NOISE_FACTOR = 8.0
 """Range of the noise within a window, in standard deviations, that is no motion."""
 STEP_S = 0.01
@@ -86,8 +89,9 @@ def stops(
         the stops in order, and the offset.
 
     Raises:
-        MeasurementError: too few motions to tell the offset, or no stop.
+        MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
     """
+    _check_times(joints, seen.times + (offset or 0.0), limits.offset if offset is None else 0.0)
     places = Recording(seen.times, seen.values[:, :3])
     rests = joints.still(limits.joints, limits.window)
     tolerance = max(limits.seen, NOISE_FACTOR * places.noise)
@@ -106,6 +110,55 @@ def stops(
         fix = "record for longer, or allow larger motions"
         raise MeasurementError.of("stops", expected="some", got="none in which both recordings stand still", fix=fix)
     return found, offset
+
+
+def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float]]:
+    """The rows of stops: column -> value, in s, m and rad; ``names`` of the joints."""
+    rows = []
+    for one in found:
+        turn = one.seen[3:] / np.linalg.norm(one.seen[3:])
+        columns = ["time", *names, *PLACE, *TURN[: len(turn)], *(f"std_{axis}" for axis in PLACE), "readings"]
+        numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
+        rows.append(dict(zip(columns, [*map(float, numbers), one.count], strict=True)))
+    return rows
+
+
+def pictured(
+    joints: Recording, times: Array, limits: StopLimits = LIMITS, offset: float = 0.0
+) -> tuple[list[tuple[Array, float]], int]:
+    """The image of each stop of the joints.
+
+    Args:
+        times: (T,) of the images, s. offset: seconds to add to these.
+
+    Returns:
+        joint values (n,), means over the stop, and the time of its image as given; and the number of stops without one.
+
+    Raises:
+        MeasurementError: recordings of different times, or no stop with an image.
+    """
+    _check_times(joints, times + offset, 0.0)
+    rests, found, without = joints.still(limits.joints, limits.window), [], 0
+    for begin, end in _both(joints.times, rests, joints.times, rests, limits):
+        nearest = np.abs(times + offset - 0.5 * (begin + end)).argmin()
+        if begin <= times[nearest] + offset <= end:
+            here = (joints.times >= begin) & (joints.times <= end)
+            found.append((joints.values[here].mean(0), float(times[nearest])))
+        else:
+            without += 1
+    if not found:
+        got = f"{without} stops, all without an image"
+        raise MeasurementError.of("stops with an image", expected="some", got=got, fix="check the offset of the clocks")
+    return found, without
+
+
+def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
+    """MeasurementError unless two recordings belong to the same time."""
+    if times.max() + tolerance < joints.times[0] or times.min() - tolerance > joints.times[-1]:
+        expected = f"those of the joint states, {joints.times[0]:.3f} to {joints.times[-1]:.3f} s"
+        got = f"{times.min():.3f} to {times.max():.3f} s"
+        fix = "let both use one clock, or give the offset"
+        raise MeasurementError.of("the times of what was seen", expected=expected, got=got, fix=fix)
 
 
 def _offset(joints: tuple[Array, Array], seen: tuple[Array, Array], largest: float) -> float:

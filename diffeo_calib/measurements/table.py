@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,11 +43,9 @@ from diffeo_calib.measurements.pose_frames import (
     visible_rotation_numbers,
 )
 from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import Distances, Sockets, SocketTable, socket_numbers
-
-if TYPE_CHECKING:
-    from diffeo_calib.measurements.readings import Readings
 
 
 @methods_outside_inference_mode
@@ -245,12 +243,17 @@ class Measurements(ImageTable, SocketTable):
         """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
 
         These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
-        then the last marker. Rows of other kinds become :class:`Observations`.
+        then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
+        and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
         """
         return joined_tables(parts)
+
+    def beside_images(self) -> list[tuple[Any, Tensor]]:
+        """See :class:`RowTable`; poses stay."""
+        return super().beside_images() if self.lever is not None else as_readings(self)
 
     @property
     def covariance(self) -> Tensor | None:

@@ -12,13 +12,16 @@ from importlib.metadata import entry_points
 
 from diffeo_calib.common.errors import InputError, MeasurementError, listed
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.sensors.beside_poses import Contacts, Trackers
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.held_tool import HeldTools
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.range import FixedPoints
 
-KINDS: dict[str, type[Devices]] = {kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools)}
+KINDS: dict[str, type[Devices]] = {
+    kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)
+}
 
 GROUP = "diffeo_calib.sensors"
 

@@ -346,6 +346,15 @@ class PlacedDevices:
         """Whether this is one set-up alone, whose frame and markers are those of the model."""
         return self.kind in (SESSION, MOUNTING) and len(self.names) == 1
 
+    @property
+    def rows_elsewhere(self) -> Tensor:
+        """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
+        if self.kind not in (SESSION, MOUNTING):
+            return self.rows[:0]
+        eye = torch.eye(4, dtype=self.constants.dtype, device=self.constants.device).flatten()
+        away = self.constants - (eye if self.kind == SESSION else 0.0)
+        return self.rows[(away != 0).any(1)[self.device.to(away.device)].to(self.rows.device)]
+
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> PlacedDevices:
         """The same devices beside another model: those of readings read of its points what they read before.
 

@@ -5,6 +5,7 @@ The robots and most rows are those of the golden numbers; here a part of the row
 
 from __future__ import annotations
 
+import copy
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -94,6 +95,19 @@ def _two_cameras() -> Source:
     return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
 
 
+def _images_and_tracker() -> Source:
+    """Images of a board, and in other rows a tracker's marker on the same tool."""
+    seen, tracker = camera_arm(60), SimulatedArm(seed=1)
+    arm, names = copy.copy(seen.arm), seen.arm.nominal.joint_names
+    arm.truth = replace(arm.truth, base=tracker.truth.base, tool=tracker.truth.tool, on=tracker.truth.on)
+    q = arm.sample(40, seed=3)
+    noise = 2e-5 * torch.randn(40, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    tracked = dc.Measurements(q, arm.true_points(q) + noise, names)
+    rows: Any = dc.Observations.joined([seen.images(0.1), tracked])  # pyright: ignore
+    golden = Golden(arm.nominal, rows, golden_bank.camera_on_tool().scales, seen.q[:5])
+    return _of_arm(golden, 0.3, seen.arm, (0, 1, 2))
+
+
 def _several() -> Source:
     """A tracker sees marker 1; the ball, marker 0, is seen by three kinds of devices."""
     arm = SimulatedArm(0, markers=2)
@@ -157,6 +171,7 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
     "images of a board": _images,
     "two cameras": _two_cameras,
+    "images and a tracker": _images_and_tracker,
     "several kinds": _several,
     "laser beams": _beams,
     "inclinations": _inclinations,
@@ -169,7 +184,7 @@ POSITIONED = ("positions", "hidden markers")
 FREE = ("ball in sockets", "distances", "heights", "images")
 """Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
-ON_TOOL = ("camera on the tool", "images of a board")
+ON_TOOL = ("camera on the tool", "images of a board", "images and a tracker")
 CAMERAS = (*ON_TOOL, "two cameras")
 
 
@@ -318,7 +333,8 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
         found += _each("--distance", [f"{a},{b}={1e3 * length}" for (a, b), length in (known.distances or {}).items()])
         found += [] if known.distance_std is None else ["--distance-std", str(1e3 * known.distance_std)]
     found += _each("--reading", [_reading(own) for own in columns.readings])
-    session = columns.session or next((own.device for own in columns.readings), None)
+    devices: Any = (own.device for own in columns.readings if own.device)
+    session = columns.session or next(devices, None)
     return found + ([] if session is None else ["--session", session])
 
 

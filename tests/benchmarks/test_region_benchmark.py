@@ -6,8 +6,13 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
+import region_limits
 import regions
+from coverage import INSIDE_95
+from reading_bank import scales
 from varied_arms import KINDS, OUTLIER_M, Kind, VariedArm
+
+import diffeo_calib as dc
 
 
 def test_an_arm_is_measured_with_its_noise() -> None:
@@ -68,3 +73,11 @@ def test_one_record() -> None:
     for name in ("new", "robot"):
         assert 0.3 < float(record[name] or 0) <= 1.0, name
     assert 0.3 < float(record["sharpness"] or 0) < 3.0
+
+
+def test_right_regions_hold_nineteen_of_twenty_in_the_mean() -> None:
+    own = regions.case("usual", 15, 0, None)
+    model = dc.calibrate(own.robot, own.train, hyperparameters=scales()).model
+    inside = (region_limits.squares(model, own.test.q[:60], 300, 0) < INSIDE_95).double().mean(0)
+    assert float(inside.mean()) == pytest.approx(0.95, abs=0.01)
+    assert 0.03 < float(inside.std()) < 0.2  # more than chance in 60 rows gives: errors have a cause in common

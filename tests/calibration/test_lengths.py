@@ -47,6 +47,18 @@ def test_right_scales_are_not_warned_about() -> None:
     assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
 
 
+@pytest.mark.parametrize(("share", "noticed"), [(0.6, False), (1.5, True)])
+def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noticed: bool) -> None:
+    """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
+    q, y = ARM.measure(ROWS, seed=1)
+    clean = warned(dc.Measurements(q, y))[0].lengths[0]
+    wrong, texts = warned(dc.Measurements(q, y * (1 + share * clean.unnoticed[0] - clean.value)))
+    assert bool(texts) == noticed
+    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * clean.unnoticed[0]
+    assert clean.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    assert "passes without a warning" in str(wrong.lengths[0])
+
+
 def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
     data = readings(ARM, "distance", ROWS, zero=0.02)
     wrong = dc.Readings.distances(

@@ -211,5 +211,5 @@ def test_a_board_that_is_not_flat_is_refused() -> None:
 def test_sentences_name_everything() -> None:
     text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
     assert all(name in text for name in LENS)
-    assert "lengths are the board's" in text
+    assert "lengths in the images are the board's" in text
     assert set(UNKNOWNS) < set(FOUND.camera.entry())

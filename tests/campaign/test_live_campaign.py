@@ -15,7 +15,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.campaign.certainty import limit_of
-from diffeo_calib.campaign.posterior import Posterior, Rows
+from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.observations import joined_tables
@@ -134,13 +134,14 @@ def test_rows_taken_one_by_one_are_those_of_a_fresh_factor(running: dc.Campaign)
     index = torch.arange(len(rows))
     whole = Posterior(rows.rows(index[:9]), model.posterior.asked)
     grown = Posterior(rows.rows(index[:3]), model.posterior.asked)
-    later = grown.see(rows.rows(index[3:]))
+    later = Seen.joined(*(grown.see(rows.rows(some)) for some in (index[3:5], index[5:])))
     for row in range(3, 9):
-        alone = grown.see(rows.rows(index[row : row + 1]))
-        later = grown.see(rows.rows(index[3:]), grown.take(alone, later))
+        later = grown.take(grown.see(rows.rows(index[row : row + 1])), later)
     expected = whole.see(rows.rows(index[3:]))
-    assert_close(later.error, expected.error)
-    assert_close(later.covariance, expected.covariance)
+    for one in (later, grown.see(rows.rows(index[3:])), later.some(index[: len(later.rows)])):
+        assert_close(one.error, expected.error)
+        assert_close(one.covariance, expected.covariance)
+        assert_close(one.asked, expected.asked)
     assert_close(grown.known, whole.known)
 
 

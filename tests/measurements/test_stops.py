@@ -1,16 +1,12 @@
-"""Stops in two recordings with clocks of their own, and a bag as a table of them."""
+"""Stops in two recordings with clocks of their own, and those that have an image."""
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
-from command_bank import Command
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.stops import Recording, StopLimits, stops
+from diffeo_calib.measurements.stops import Recording, StopLimits, pictured, stops
 
 STOPS, STAND_S, MOVE_S, OFFSET_S = 8, 1.5, 0.7, 0.437
 NOISE_M = 2e-5
@@ -61,45 +57,22 @@ def test_recordings_without_stops_or_motions_are_refused() -> None:
     assert len(stops(joints, seen, offset=OFFSET_S)[0]) == STOPS
 
 
-def test_a_bag_becomes_a_table(tmp_path: Path, command: Command) -> None:
-    rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs rosbags")
-    from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types, nothing = store.types, np.zeros(0)
-
-    def header(time: float):
-        nanoseconds = round(1e9 * (time + 100))
-        stamp = types["builtin_interfaces/msg/Time"](sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-
-    state, pose = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
+def test_recordings_of_different_times_are_refused() -> None:
     joints, seen = recordings()
-    quaternion = types["geometry_msgs/msg/Quaternion"]
-    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
-        topics = [writer.add_connection(*names, typestore=store) for names in (("/joint_states", state), ("/at", pose))]
-        for time, q in zip(joints.times, joints.values, strict=True):
-            message = types[state](header(time), ["a", "b"], q, nothing, nothing)
-            writer.write(topics[0], round(1e9 * (time + 100)), store.serialize_cdr(message, state))
-        for row, (time, p) in enumerate(zip(seen.times, seen.values, strict=True)):
-            turn = quaternion(0.0, 0.0, (-1.0) ** row, 0.0)  # the sign of a quaternion has no meaning
-            at = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](*p), turn)
-            writer.write(topics[1], round(1e9 * (time + 100)), store.serialize_cdr(types[pose](header(time), at), pose))
-    done = command("record", tmp_path / "bag", "--seen", "/at", "-o", tmp_path / "run.csv")
-    assert done.code == 0, done.err
-    with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == STOPS
-    assert [abs(float(rows[0][name])) for name in ("qx", "qy", "qz", "qw")] == [0, 0, 1, 0]
-    q = np.array([[float(row[name]) for name in "ab"] for row in rows])
-    y = np.array([[float(row[name]) for name in "xyz"] for row in rows])
-    np.testing.assert_allclose(y, place(q), rtol=0, atol=1e-4)
-    refused = command("record", tmp_path / "bag", "--seen", "/other", "-o", tmp_path / "run.csv")
-    assert refused.code == 1
-    assert "/other" in refused.err
+    for offset in (None, 0.0):
+        with pytest.raises(MeasurementError, match=r"-1000\.437 to -98"):
+            stops(joints, Recording(seen.times - 1000, seen.values), offset=offset)
+    with pytest.raises(MeasurementError, match=r"0\.000 to 17"):
+        pictured(joints, seen.times + 1000)
 
 
-def test_a_missing_bag_is_one_error(tmp_path: Path, command: Command) -> None:
-    done = command("record", tmp_path / "none", "--seen", "/at", "-o", tmp_path / "run.csv")
-    assert done.code == 1
-    assert "none" in done.err
+def test_each_stop_takes_the_image_nearest_to_its_middle() -> None:
+    joints, _ = recordings()
+    middles = np.arange(STOPS) * (STAND_S + MOVE_S) + 0.5 * STAND_S
+    times = np.concatenate([middles[1:] + 0.1, middles[1:] - 0.2, middles + 0.5 * (STAND_S + MOVE_S), [0.02]])
+    found, without = pictured(joints, times - 3.0, offset=3.0)
+    assert [time for _, time in found] == pytest.approx(list(middles[1:] + 0.1 - 3.0))
+    assert without == 1
+    np.testing.assert_allclose([q for q, _ in found], angle(middles[1:]), rtol=0, atol=5e-4)
+    with pytest.raises(MeasurementError, match="without an image"):
+        pictured(joints, middles[:-1] + 0.5 * (STAND_S + MOVE_S))

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
-from diffeo_calib.common.quantiles import chi2_probability
+from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ class Length(NamedTuple):
     Args:
         cause: what. value, deviation: s and sd, in m or relative. displacement: RMS motion of a coordinate by s, m.
         chance: probability that a usual robot shows as much.
+        unnoticed: largest size that passes without a warning, and the RMS motion of a coordinate by it, m.
     """
 
     cause: Cause
@@ -67,13 +68,18 @@ class Length(NamedTuple):
     deviation: float
     displacement: float
     chance: float
+    unnoticed: tuple[float, float] = (0.0, 0.0)
 
     def __str__(self) -> str:
         unit, size = self.cause.unit or MILLIMETRE
         text = (
             f"{self.cause.name} against its description: {self.value / size:+.2g} +- {self.deviation / size:.2g} {unit}"
         )
-        return f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm"
+        least, motion = self.unnoticed
+        return (
+            f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm; "
+            f"less than {least / size:.2g} {unit} ({1e3 * motion * 3**0.5:.2g} mm) passes without a warning"
+        )
 
 
 def lengths(
@@ -103,9 +109,11 @@ def lengths(
             continue
         excess = max(1.0, (total - g**2 / h) / max(told.coordinates, 1))  # of errors that are not usual
         value, deviation = g / h, (excess / h) ** 0.5
-        displacement = abs(value) * float(moved[some.visible].square().mean().sqrt())
-        found.append(Length(cause, value, deviation, displacement, chi2_probability((value / deviation) ** 2, 1)))
-    return found
+        motion = float(moved[some.visible].square().mean().sqrt())
+        chance = chi2_probability((value / deviation) ** 2, 1)
+        found.append(Length(cause, value, deviation, abs(value) * motion, chance, (deviation, deviation * motion)))
+    allowed = chi2_above(limits.chance / max(len(found), 1), 1) ** 0.5
+    return [one._replace(unnoticed=(allowed * one.unnoticed[0], allowed * one.unnoticed[1])) for one in found]
 
 
 def doubtful(found: list[Length], limits: LengthLimits = LIMITS) -> Length | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack
 from queue import Empty, Queue
 from threading import Thread
@@ -16,13 +17,15 @@ from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.commands.fit import RobotFile
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.live import Live, Shown, expected
-from diffeo_calib.cli.options import LiveOptions
+from diffeo_calib.cli.live import ID, Live, Shown, expected
+from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.bags import read_bag
 from diffeo_calib.measurements.csv.files import read_joints
+from diffeo_calib.measurements.stops import rows_of, stops
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
@@ -37,7 +40,7 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     limit = parsed_limit(given.target, "--target")
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--target {given.target}", expected="a length, such as 0.15mm")
-    robot = links.read()
+    robot, played = links.read(), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
@@ -51,12 +54,45 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
         for where, face in (("shown", page and page.url), ("listening", listener and listener.address)):
             if face is not None:
                 live.say(f"the campaign is {where} at {face}", {where: face})
+        if given.bag is not None:
+            Thread(target=play, args=(played, inbox, live.ids, given.speed), daemon=True).start()
         code = _followed(live, given, inbox, page)
         _end(live, inbox, listener)
     if given.accepted is not None:
         write_whole(given.accepted, live.table.header + b"".join(live.lines_of(campaign.accepted)))
     if code:
         raise typer.Exit(code)
+
+
+def _stops(source: MeasuredTable, given: LiveOptions) -> list[dict[str, float]]:
+    """The stops of a bag; InputError for a table in other units."""
+    if given.bag is None or given.seen is None:
+        return []
+    units = source.table.length, source.table.joint_length or source.table.length, source.table.angle
+    if units != ("m", "m", "rad"):
+        got = f"--length {units[0]}, --angle {units[2]}"
+        raise InputError.of("the stops of --bag are in m and rad", got=got, fix="add --length m --angle rad")
+    joints, names, seen = read_bag(given.bag, given.joint_states, given.seen)
+    if not seen.values.shape[1]:
+        fix = "use `record`, then `images`"
+        raise InputError.of(f"{given.seen} of --bag", expected="places that a device measured", got="images", fix=fix)
+    return rows_of(names, stops(joints, seen)[0])
+
+
+def play(
+    rows: Sequence[dict[str, float]],
+    inbox: Inbox,
+    known: Container[str],
+    speed: float,
+    sleep: Callable[[float], object] = time.sleep,
+) -> None:
+    """Put rows into an inbox at their times [s], then None; those whose numbers are known were taken in before."""
+    left = [(number, row) for number, row in enumerate(rows) if str(number) not in known]
+    begin = time.monotonic() - left[0][1]["time"] / speed if left else 0.0
+    for number, row in left:
+        sleep(max(begin + row["time"] / speed - time.monotonic(), 0.0))
+        inbox.put(Sent({ID: number, **row}, lambda _: None))
+    inbox.put(None)
 
 
 def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -> int:

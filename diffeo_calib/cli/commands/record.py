@@ -1,37 +1,56 @@
-"""`diffeo-calib record`: a bag as a table of stops."""
+"""`diffeo-calib record`: a bag as a table of stops, or as the images of stops and their joint values."""
 
 from __future__ import annotations
 
 import csv
 import io
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.bags import read_bag
-from diffeo_calib.measurements.stops import StopLimits, stops
-
-PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+from diffeo_calib.measurements.bags import read_bag, read_images
+from diffeo_calib.measurements.csv.images import IMAGE
+from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 
 
 def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, offset: float | None) -> None:
     """Find the stops, write them, and say how to go on."""
     joints, names, seen = read_bag(bag, *topics)
-    found, offset = stops(joints, seen, limits, offset)
-    turned = seen.values.shape[1] > len(PLACE)
-    text = io.StringIO(newline="")
-    sheet = csv.writer(text, lineterminator="\n")
-    sheet.writerow(["time", *names, *PLACE, *(TURN if turned else ()), *(f"std_{axis}" for axis in PLACE), "readings"])
-    for one in found:
-        turn = one.seen[3:] / np.linalg.norm(one.seen[3:]) if turned else one.seen[3:]
-        numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
-        sheet.writerow([*map(repr, map(float, numbers)), one.count])
-    write_whole(output, text.getvalue().encode())
+    if seen.values.shape[1]:
+        found, offset = stops(joints, seen, limits, offset)
+        table = rows_of(names, found)
+        write_whole(output, _text(table))
+        say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {topics[1]}")
+        rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
+        say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
+    else:
+        offset = offset or 0.0
+        found, without = pictured(joints, seen.times, limits, offset)
+        files = _write_images(bag, topics[1], output.parent, [time for _, time in found])
+        rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]
+        write_whole(output, _text(rows))
+        left = f"; {without} stops without an image were left out" * bool(without)
+        say(f"{len(found)} images of stops written beside {shown(output)}{left}")
+        say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")
     record.add(rows=len(found), clock_offset_s=offset, files={"table": output})
-    say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {topics[1]}")
-    rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * turned
-    say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
+
+
+def _write_images(bag: Path, topic: str, folder: Path, times: list[float]) -> dict[float, str]:
+    """Write the images of some times, in their order; the name of each."""
+    files = dict[float, str]()
+    for time, suffix, content in read_images(bag, topic, times):
+        files[time] = f"{times.index(time):05d}{suffix}"
+        write_whole(folder / files[time], content)
+    return files
+
+
+def _text(rows: list[dict[str, Any]]) -> bytes:
+    """Rows as CSV."""
+    text = io.StringIO(newline="")
+    sheet = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    sheet.writeheader()
+    sheet.writerows(rows)
+    return text.getvalue().encode()

@@ -11,11 +11,9 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.sensors import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat
 
 IMAGE, POINT, PIXEL, CAMERA = "image", ("board_x", "board_y"), ("u", "v"), "camera"
 """Columns: name of the image, place of the corner on the board in the unit of length, pixels; name of the camera, if
@@ -93,26 +91,23 @@ def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
             raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
 
 
-def image_sheet(
-    data: Measurements, table: TableFormat, numeric: Columns, session: str | None
-) -> tuple[list[str], list[list[Any]], ImageColumns]:
-    """Header and cells of images, and how to read them; arguments as of :func:`write_measurements`."""
-    if data.corners is None:
-        raise AssertionError("a table of images")
-    number, corner = (~data.corners[..., 0].isnan()).nonzero().unbind(1)
-    points = data.corners[number, corner]
-    values = [numeric.joints_from_si(data.q)[number], table.per_metre * points[:, :2], points[:, 3:]]
-    texts: list[list[Any]] = [[str(k) for k in number.tolist()], *torch.cat(values, 1).T.tolist()]
-    more = {} if data.payload is None else {table.payload or "payload": data.payload.tolist()}
-    more |= {table.covariates.get(name, name): values.tolist() for name, values in data.drifting.items()}
+def written_columns(data: Any, session: str | None) -> ImageColumns:
+    """How to read images that are written, with this column of set-ups."""
     several = len(data.cameras) > 1
-    session = None if several and data.device_names == data.camera_names else session
-    more |= {session: data.device_names} if session is not None else {}
-    more |= {CAMERA: data.camera_names} if several else {}
-    texts += [[column[k] for k in number.tolist()] for column in more.values()]
+    session = None if not data.session_names or (several and data.device_names == data.camera_names) else session
     sizes = {name: (camera.width, camera.height) for name, camera in data.cameras.items()}
-    columns = ImageColumns(sizes if several else sizes.popitem()[1], data.board is not None, session)
-    return [IMAGE, *numeric.joints, *POINT, *PIXEL, *more], [list(row) for row in zip(*texts, strict=True)], columns
+    return ImageColumns(sizes if several else sizes.popitem()[1], data.board is not None, session)
+
+
+def corner_lines(data: Any, cells: Mapping[str, list[Any]], per_metre: float) -> tuple[dict[str, list[Any]], Tensor]:
+    """The cells of a line for each corner, from those of each image, and the number (M,) of its image."""
+    number, corner = (~data.corners[..., 0].isnan()).nonzero().unbind(1)
+    points, whose = data.corners[number, corner], number.tolist()
+    named = {CAMERA: data.camera_names} if len(data.cameras) > 1 else {}
+    found = {IMAGE: [str(k) for k in whose]}
+    found |= {name: [column[k] for k in whose] for name, column in {**cells, **named}.items()}
+    corners = torch.cat([per_metre * points[:, :2], points[:, 3:]], 1)
+    return found | dict(zip((*POINT, *PIXEL), corners.T.tolist(), strict=True)), number
 
 
 def image_size(words: Sequence[str]) -> tuple[int, int] | None:

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -14,12 +15,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
 from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
-from diffeo_calib.measurements.csv.images import image_sheet
+from diffeo_calib.measurements.csv.images import ImageColumns, corner_lines, written_columns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame, inverse_poses, visible_rotation_numbers
@@ -269,19 +270,15 @@ def write_measurements(
     columns = replace(sheet.columns, joints=names, kinds=kinds)
     numeric = Columns.of(sheet.table, names, kinds, position_triples(columns.position) if columns.position else [])
     check_count("joint columns", numeric.joints, whole.n, "joint")
-    if whole.parts[0].columns.get("corners") is not None:
-        device = session or (SESSION if whole.session_names else None)
-        header, lines, own = image_sheet(whole.parts[0], table, numeric, device)
-        write_rows(path, header, [lines], table)
-        return TableColumns(names, readings=(own,), kinds=kinds), replace(table, camera_on_tool=False)
     _check_distinct(sheet, numeric)
-    cells: dict[str, list[float | str]] = {name: [""] * len(whole) for name in numeric.names}
-    for part, rows in zip(whole.parts, whole.index, strict=True):
-        for name, values in sheet.cells(part, numeric).items():
-            column = cells.setdefault(name, [""] * len(whole))
-            for row, value in zip(rows.tolist(), values, strict=True):
-                column[row] = value
-    write_rows(path, list(cells), [[list(row) for row in zip(*cells.values(), strict=True)]], sheet.table)
+    parts = [sheet.cells(part, numeric) for part in whole.parts]
+    order = torch.cat([rows[lines] for rows, (_, lines) in zip(whole.index, parts, strict=True)]).argsort(stable=True)
+    cells: dict[str, list[float | str]] = {name: [""] * len(order) for name in numeric.names}
+    for done, (own, lines) in zip(accumulate((len(own[1]) for own in parts), initial=0), parts, strict=False):
+        for name in own:
+            cells.setdefault(name, [""] * len(order))[done : done + len(lines)] = own[name]
+    whole_lines = [list(line) for line in zip(*cells.values(), strict=True)]
+    write_rows(path, list(cells), [[whole_lines[k] for k in order.tolist()]], sheet.table)
     return columns, sheet.table
 
 
@@ -291,12 +288,12 @@ class _Sheet:
 
     Args:
         columns: those of each kind; its joints are not named yet. table: their format, with the names of deviations.
-        readings: columns of each part with readings, by the part's identity.
+        readings: columns of each part with readings, or images, by the part's identity.
     """
 
     columns: TableColumns
     table: TableFormat
-    readings: dict[int, ReadingColumns]
+    readings: dict[int, Any]
 
     @classmethod
     def of(cls, whole: Observations, table: TableFormat, position: Names | None, session: str | None) -> _Sheet:
@@ -307,6 +304,8 @@ class _Sheet:
             raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
         device, triples = measured[0] if measured else None, None
         _check_held(device, whole, table, position)
+        if device is not None and device.corners is not None:
+            device, table = None, replace(table, camera_on_tool=False)
         if device is not None:
             triples = position_triples(position or device.position_names)
             table = replace(_with_names(device, table, triples), remounted=device.remounted)
@@ -323,20 +322,33 @@ class _Sheet:
         columns = TableColumns((), triples, _socket_columns(whole), tuple(readings.values()), own, on=on)
         return cls(columns, table, readings)
 
-    def cells(self, part: Any, numeric: Columns) -> dict[str, list[Any]]:
-        """The cells of the rows of one part, by name, in the units of the file."""
+    def cells(self, part: Any, numeric: Columns) -> tuple[dict[str, list[Any]], Tensor]:
+        """The cells of the lines of one part, by name, in the units of the file, and the rows (M,) of these lines."""
         found = _named(numeric.joints, numeric.joints_from_si(part.q))
-        if part.kind in ("position", "pose"):
+        known: Any = self.readings.get(id(part))
+        images = isinstance(known, ImageColumns)
+        if images:
+            pass
+        elif part.kind in ("position", "pose"):
             found |= _position_cells(part, numeric)
         elif part.kind == "socket":
             found[SOCKET] = part.row_sockets
         else:
-            found |= _reading_cells(part, self.readings[id(part)], numeric)
+            found |= _reading_cells(part, known, numeric)
         if part.payload is not None and numeric.payload:
             found[numeric.payload[0]] = part.payload.tolist()
         found |= _named(numeric.covariates, part.covariates) if numeric.covariates else {}
-        session = self.columns.session or next((one.device for one in self.columns.readings), None)
-        return found if session is None or not any(part.device_names) else found | {session: part.device_names}
+        session = known.device if images else self._session
+        found |= {} if session is None or not any(part.device_names) else {session: part.device_names}
+        if images:
+            return corner_lines(part, found, numeric.table.per_metre)
+        return found, torch.arange(len(part), device=HOST)
+
+    @property
+    def _session(self) -> str | None:
+        """Column of set-ups and devices."""
+        devices = (one.device for one in self.columns.readings if one.device is not None)
+        return self.columns.session or next(devices, None)
 
 
 def _tips(device: Any) -> list[str] | None:
@@ -369,11 +381,14 @@ def _socket_columns(whole: Observations) -> SocketColumns | None:
     return SocketColumns((SOCKET,), distances or None, part.sockets.distance_std, part.ball_tip)
 
 
-def _reading_columns(whole: Observations, session: str | None) -> dict[int, ReadingColumns]:
+def _reading_columns(whole: Observations, session: str | None) -> dict[int, Any]:
     """Columns of the parts with readings, by their identity; those of a second part of a kind with a number."""
-    found: dict[int, ReadingColumns] = {}
+    found: dict[int, Any] = {}
     taken: list[str] = []
     for part in whole.parts:
+        if part.columns.get("corners") is not None:
+            found[id(part)] = written_columns(part, session)
+            continue
         if part.kind in ("position", "pose", "socket"):
             continue
         plain = part.value_names

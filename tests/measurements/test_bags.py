@@ -1,0 +1,124 @@
+"""Bags of ROS 2 as tables of stops, and as images with their joint values. Skipped without rosbags."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_bank import JOINTS, PICTURES, PLACES, Bag
+from command_bank import Command
+
+from diffeo_calib.measurements.bags import read_images
+
+NAMES, STAND_S, MOVE_S, START_S = ["a", "b"], 1.0, 0.5, 100.0
+PLACES_RAD = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+MIDDLES = START_S + np.arange(5) * (STAND_S + MOVE_S) + 0.5 * STAND_S
+PIXELS = np.random.default_rng(1).integers(0, 255, (4, 5, 3))
+PNG = b"\x89PNG of this test"
+
+
+def motion(rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times, s, and two joints (T, 2), rad, that stand at each place and turn to the next."""
+    times = np.arange(0, len(PLACES_RAD) * (STAND_S + MOVE_S), 1 / rate)
+    number, rest = np.divmod(times, STAND_S + MOVE_S)
+    share = np.clip((rest - STAND_S) / MOVE_S, 0, 1)[:, None]
+    first, after = (PLACES_RAD[np.minimum(number.astype(int) + k, len(PLACES_RAD) - 1)] for k in (0, 1))
+    return START_S + times, first + share * (after - first)
+
+
+def place(q: np.ndarray) -> np.ndarray:
+    """Where the tool is (T, 3), m."""
+    return np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]], 1)
+
+
+@pytest.fixture
+def bag() -> Bag:
+    made = Bag()
+    made.joints(*motion(25), NAMES)
+    return made
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_bag_becomes_a_table(bag: Bag, tmp_path: Path, command: Command) -> None:
+    times, q = motion(130)
+    bag.poses(times - 0.437, place(q))
+    done = command("record", bag.write(tmp_path / "bag"), "--seen", PLACES, "-o", tmp_path / "run.csv")
+    assert done.code == 0, done.err
+    table = rows(tmp_path / "run.csv")
+    found = np.array([[float(row[name]) for name in NAMES] for row in table])
+    np.testing.assert_allclose(found, PLACES_RAD, rtol=0, atol=5e-4)
+    np.testing.assert_allclose([[float(row[k]) for k in "xyz"] for row in table], place(found), rtol=0, atol=1e-4)
+    assert [abs(float(table[0][name])) for name in ("qx", "qy", "qz", "qw")] == [0, 0, 1, 0]
+    assert int(table[0]["readings"]) > 50
+
+
+def test_images_of_stops_and_their_joints(bag: Bag, tmp_path: Path, command: Command) -> None:
+    moving = MIDDLES + 0.5 * (STAND_S + MOVE_S)
+    bag.packed([*MIDDLES[1:], *moving, START_S - 1], PNG)
+    out = tmp_path / "joints.csv"
+    done = command("record", bag.write(tmp_path / "bag"), "--seen", PICTURES, "-o", out)
+    assert done.code == 0, done.err
+    assert "4 images" in done.out
+    assert "1 stops without" in done.out
+    table = rows(out)
+    found = [[float(row[name]) for name in NAMES] for row in table]
+    np.testing.assert_allclose(found, PLACES_RAD[1:], rtol=0, atol=5e-4)
+    assert all((tmp_path / row["image"]).read_bytes() == PNG for row in table)
+    assert len({row["image"] for row in table}) == 4
+
+
+def test_raw_images_keep_their_pixels(bag: Bag, tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    grey = PIXELS[..., :1]
+    for encoding, pixels, expected in (
+        ("bgr8", PIXELS, PIXELS),
+        ("rgb8", PIXELS, PIXELS[..., ::-1]),
+        ("mono8", grey, np.repeat(grey, 3, 2)),
+    ):
+        bag.topics.pop(PICTURES, None)
+        bag.images(MIDDLES, pixels, encoding)
+        path = bag.write(tmp_path / encoding)
+        ((time, suffix, content),) = read_images(path, PICTURES, [MIDDLES[2]])
+        assert (time, suffix) == (MIDDLES[2], ".png")
+        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR), expected)
+
+
+def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, command: Command) -> None:
+    times, q = motion(10)
+    bag.poses(times + 1000, place(q))
+    bag.packed([], PNG)
+    other, unknown, cut, zero = Bag(), Bag(), Bag(), Bag()
+    for one in (other, unknown, cut):
+        one.topics[JOINTS] = bag.topics[JOINTS]
+    other.packed(MIDDLES, b"something")
+    unknown.images(MIDDLES, PIXELS, "bayer_rggb8")
+    cut.images(MIDDLES, PIXELS, "bgr8")
+    cut.topics[PICTURES][1][2][1].data = np.zeros(3, np.uint8)
+    zero.joints(np.zeros(9), np.zeros((9, 2)), NAMES)
+    written = {name: one.write(tmp_path / name) for name, one in locals().items() if isinstance(one, Bag)}
+    Bag().write(tmp_path / "empty")
+    cases = [
+        (written["bag"], "/other", [], ["/other", PLACES]),
+        (written["bag"], PICTURES, [], [PICTURES, "0"]),
+        (written["bag"], PLACES, [], ["1100", "107"]),
+        (written["bag"], PICTURES, ["--joints", PLACES], ["JointState", "PoseStamped"]),
+        (written["bag"], JOINTS, [], ["images"]),
+        (written["other"], PICTURES, [], [".png"]),
+        (written["unknown"], PICTURES, [], ["bayer_rggb8", "bgr8"]),
+        (written["cut"], PICTURES, [], ["5 x 4", "3 bytes"]),
+        (written["other"], PICTURES, ["--offset", "-0.6"], ["without an image"]),
+        (written["zero"], JOINTS, [], ["images"]),
+        (tmp_path / "empty", PLACES, [], ["empty", PLACES]),
+        (tmp_path / "none", PLACES, [], ["none"]),
+    ]
+    for path, topic, more, words in cases:
+        done = command("record", path, "--seen", topic, "-o", tmp_path / "run.csv", *more)
+        assert done.code == 1, (topic, done.out)
+        assert all(word in done.err for word in words), (words, done.err)
+        assert not (tmp_path / "run.csv").exists()
