@@ -19,6 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from torch import Tensor
+
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
 from diffeo_calib.calibration.scales.differing_noise import new_noise
@@ -288,7 +290,7 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     sag = data.nominal.elasticity
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
-    _, some = data.sample(POSES, COORDINATES, seed)
+    some = data.sample(POSES, COORDINATES, seed)[1].told
     tried = [replace(scales, payload=factor) for factor in FACTORS]
     return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))
 
@@ -302,6 +304,12 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
     Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
     """
+    problem = _problem(data, scales, new_noise(data, scales))
+    return problem if data.told is data else _problem(data.told, scales, problem.new_noise).standing_for(problem)
+
+
+def _problem(data: TangentData, scales: Hyperparameters, noise: Tensor | None) -> Problem:
+    """The same with all numbers of the rows; ``noise`` (m, m) of a new measurement, m^2."""
     problem = Problem(
         data.nominal.typical,
         data.x,
@@ -311,7 +319,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         noise=Noise(data.weighted_noise(scales), data.shared),
         markers=data.nominal.geometry.markers,
         prior_variance=data.prior_variance(scales),
-        new_noise=new_noise(data, scales),
+        new_noise=noise,
         observe=data.observe,
     )
     return problem.with_nominal_of_rows(data.nominal)

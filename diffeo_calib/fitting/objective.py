@@ -74,6 +74,7 @@ class Objective(ABC, Generic[D]):
         controls: (M, n) configurations that carry momenta. reduced: whether they differ from the data's.
         new_noise: (m, m) covariance of a new measurement, m^2; None for the mean of ``noise``.
         observe: what was measured of k1; None for all its coordinates.
+        whole: the problem whose maps the fit leads to, by default its own; see :meth:`Problem.standing_for`.
         certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps.
     """
 
@@ -86,6 +87,7 @@ class Objective(ABC, Generic[D]):
     new_noise: Tensor | None
     certified: bool
     observe: Observation | None = None
+    whole: Objective[D] | None = None
 
     @abstractmethod
     def zero(self) -> Momenta:
@@ -101,6 +103,8 @@ class Objective(ABC, Generic[D]):
 
     def calibrated(self, deformation: D) -> FittedMap:
         """A deformation of this problem as the map that users work with."""
+        if self.whole is not None:
+            return self.whole.calibrated(self.whole.deform(deformation.momenta, deformation.integrator))
         slopes = self.slopes(deformation)
         data = self.x if self.reduced else None
         return FittedMap(deformation, self.noise, data, self.new_noise, slopes=slopes, y=self.y)

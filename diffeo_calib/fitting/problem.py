@@ -61,6 +61,8 @@ class Problem(Objective[GeodesicDeformation]):
             defined at the data.
     """
 
+    whole: Problem | None = None
+
     def __init__(
         self,
         nominal: NominalMap | Callable[[Tensor], Tensor],
@@ -137,6 +139,7 @@ class Problem(Objective[GeodesicDeformation]):
         other.spec, other.noise = self.spec.to(device), self.noise.to(device)
         other.new_noise = None if self.new_noise is None else self.new_noise.to(device)
         other.observe = None if self.observe is None else self.observe.to(device)
+        other.whole = None if self.whole is None else self.whole.to(device)
         return other
 
     def with_controls(self, controls: object) -> Problem:
@@ -151,6 +154,7 @@ class Problem(Objective[GeodesicDeformation]):
         n = self.x.shape[1]
         other.controls = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
         other.reduced = not torch.equal(other.controls, self.x)
+        other.whole = None if self.whole is None else self.whole.with_controls(controls)
         return other
 
     def with_nominal_of_rows(self, nominal: NominalMap) -> Problem:
@@ -161,12 +165,23 @@ class Problem(Objective[GeodesicDeformation]):
         other.spec = replace(self.spec, at_controls=nominal)
         return other
 
+    def standing_for(self, whole: Problem) -> Problem:
+        """The same problem, whose fits lead to the maps of another one with the same unknowns.
+
+        It has the same optimum, and fewer numbers: functionals of the coordinates that the other one has, which tell
+        all there is to know.
+        """
+        other = copy(self)
+        other.whole = whole
+        return other
+
     def subset(self, rows: Tensor) -> Problem:
         """The same problem with only the measurements of these row numbers."""
         other = copy(self)
         other.x, other.y, other.noise = self.x[rows], self.y[rows], self.noise.rows(rows)
         other.controls, other.reduced = other.x, False
         other.observe = None if self.observe is None else self.observe.rows(rows)
+        other.whole = None if self.whole is None else self.whole.subset(rows)
         return other
 
     def zero(self) -> Momenta:

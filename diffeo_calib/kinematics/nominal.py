@@ -15,6 +15,7 @@ from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
+from diffeo_calib.robots.se3 import skew
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
@@ -32,6 +33,7 @@ class GeometryMap(NominalMap):
         elastic: whether theta includes coefficients of elasticity.
         waves: periodic errors of joints.
         payload: known masses that the robot carries, for an elastic one.
+        rigid: whether markers are points of frames, three each, which move as a whole: what bends them has no effect.
 
     Raises:
         InputError: waves of joints that are not there, or a payload of a robot that does not bend.
@@ -44,6 +46,7 @@ class GeometryMap(NominalMap):
         elastic: bool = False,
         waves: GearWaves = NO_WAVES,
         payload: Payload | None = None,
+        rigid: bool = False,
     ) -> None:
         waves.check(geometry.chain.n)
         load = payload or NO_PAYLOAD
@@ -51,7 +54,7 @@ class GeometryMap(NominalMap):
             load.check_elastic()
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
-        self.waves = waves
+        self.waves, self.rigid = waves, rigid
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0) + waves.size
         entries, parts = range(geometry.size), geometry.slices
         self.places = (*entries[parts["base"]], *entries[parts["tool"]])
@@ -83,8 +86,12 @@ class GeometryMap(NominalMap):
         """The same map with other masses of its payload."""
         return self if load is self.load else self._with(payload=load or None)
 
+    def with_rigid_frames(self) -> GeometryMap:
+        """The same map of the points of frames, see ``rigid``."""
+        return self._with(rigid=True)
+
     def _with(self, **changes: Any) -> GeometryMap:
-        own = {"geometry": self.geometry, "waves": self.waves, "payload": self.payload}
+        own = {"geometry": self.geometry, "waves": self.waves, "payload": self.payload, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
@@ -148,12 +155,20 @@ class GeometryMap(NominalMap):
         turned = self._turned(x, theta)
         by_error = self.geometry.sensitivities(turned, self._errors(turned, theta))
         parts = [by_error.flatten(1, 2)]
+        if self.rigid:
+            tool = self.geometry.slices["tool"]
+            parts = [parts[0][..., : tool.start], parts[0][..., tool] @ self._rigid_tool().to(x.device)]
         if self.elasticity is not None:
             parts.append(self.elasticity.sensitivities(turned, self._by_twist(by_error)))
         if self.waves.size:
             joints = [joint for joint in self.waves.joints for _ in range(2)]
             parts.append(self._smooth_jacobian(turned, theta)[..., joints] * self.waves.columns(x)[:, None])
         return torch.cat(parts, dim=2)
+
+    def _rigid_tool(self) -> Tensor:
+        """Projection (3 P, 3 P) of shifts of the tool's points on those that move every frame as a rigid body."""
+        moves = rigid_motions(self.geometry.tool.flatten())
+        return torch.block_diag(*(moves @ moves.mT))
 
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
@@ -168,6 +183,14 @@ class GeometryMap(NominalMap):
     def _by_twist(self, by_error: Tensor) -> Tensor:
         """The columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
         return by_error.flatten(1, 2)[..., self.geometry.slices["joints"]].unflatten(-1, (-1, 6))
+
+
+def rigid_motions(points: Tensor) -> Tensor:
+    """Orthonormal columns (..., B, 9, 6), all motions of every three of points (..., 9 B) as a rigid body."""
+    arms = points.unflatten(-1, (-1, 3, 3))
+    arms = arms - arms.mean(-2, keepdim=True)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape, 3)
+    return torch.linalg.qr(torch.cat([eye, -skew(arms)], -1).flatten(-3, -2)).Q
 
 
 def _all_zero(coefficients: Tensor) -> bool:

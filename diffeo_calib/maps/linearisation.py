@@ -59,8 +59,10 @@ class NodeSensitivity:
         """weight * effect K other.effect^T: (L r, L' r')."""
         if self.together == 1:
             return kernel.gram(self.points, self.weight * self.effect, other.points, other.effect)
-        each = kernel.gram(self.points, self.weight * self.by_point(), other.points, other.effect)
-        return each.reshape(len(self.effect), self.together, self.effect.shape[1], -1).sum(1).flatten(0, 1)
+        (L, _, width), k = self.effect.shape, self.points.shape[1]
+        single = torch.eye(k, dtype=self.effect.dtype, device=self.effect.device).expand(len(self.points), k, k)
+        each = kernel.gram(self.points, single, other.points, other.effect)  # (L Q k, L' r)
+        return (self.weight * self.effect @ each.unflatten(0, (L, width))).flatten(0, 1)
 
     def rows(self, rows: Tensor) -> NodeSensitivity:
         """The sensitivity of the selected ends."""

@@ -10,9 +10,11 @@ import pytest
 import torch
 from again_bank import arm, model, positions
 from product_bank import usual_scales
+from torch import Tensor
+from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.changes import Change, Changes
+from diffeo_calib.calibration.recalibration.changes import NOISE_FACTORS, SIZES, Change, Changes, likelihood_ratios
 from diffeo_calib.calibration.recalibration.compare import Comparison
 from diffeo_calib.calibration.recalibration.new_set_up import place_again
 from diffeo_calib.calibration.recalibration.recalibrate import weighed
@@ -91,3 +93,31 @@ def test_an_offset_between_two_models_is_named() -> None:
             assert one.deviation is not None
             assert one.size == pytest.approx(OFFSET, abs=4 * one.deviation)
             assert one.part in str(compared)
+
+
+def test_ratios_are_those_of_the_definition() -> None:
+    """Largest densities over all levels of noise and sizes of the change, with explicit matrices."""
+    draws = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=draws, dtype=torch.float64)
+
+    shapes, roots, noise = normal(18, 4), {"a": normal(6, 3, 2), "b": normal(6, 3, 1)}, normal(6, 3, 5)
+    base, noise = shapes @ shapes.T, noise @ noise.mT
+    residual = 3.0 * roots["a"] @ normal(2) + normal(6, 3)
+    seen = SimpleNamespace(coordinates=lambda y: torch.ones_like(y, dtype=torch.bool))
+    rows: Any = SimpleNamespace(weighted_noise=noise, noise_model=seen, y=residual, residual=residual)
+    found, level = likelihood_ratios(rows, base, roots, seed=0)
+
+    def densities(root: Tensor, sizes: Tensor) -> Tensor:  # (noise, sizes)
+        columns = root.flatten(0, 1)
+        levels = base + NOISE_FACTORS[:, None, None] * torch.block_diag(*noise)
+        covariances = levels[:, None] + sizes[:, None, None] * (columns @ columns.T)
+        return MultivariateNormal(torch.zeros_like(residual.flatten()), covariances).log_prob(residual.flatten())
+
+    without = densities(roots["a"], torch.zeros(1, dtype=torch.float64))
+    assert level**2 == pytest.approx(float(NOISE_FACTORS[without[:, 0].argmax()]))
+    for name, root in roots.items():
+        best = densities(root, SIZES).amax(0)
+        assert found[name].value == pytest.approx(2.0 * float(best.max() - without.max()), rel=1e-6)
+        assert found[name].variance == pytest.approx(float(SIZES[best.argmax()]))

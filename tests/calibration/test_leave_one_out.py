@@ -133,7 +133,7 @@ def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
 def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request: pytest.FixtureRequest) -> None:
     """Conditioned on everything: the mean error, and the uncertainty of the signal. One round, from given weights."""
     case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned()
+    data = case.conditioned().told
     n, m = data.y.shape
     G, total = data.linearisation(case.scales).gram(), data.covariance_terms(case.scales).matrix()
     target = data.target.flatten()
@@ -153,13 +153,14 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
 def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
     case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned()
+    whole = case.conditioned()
+    data, found = whole.told, leave_one_out(whole, case.scales)
     n, m = data.y.shape
     G, noise = data.linearisation(case.scales).gram(), data.noise(case.scales)
     weighted_noise = data.weighted_noise(case.scales)
-    found = leave_one_out(data, case.scales)
-    assert found.errors.shape == (n, m)
+    assert found.errors.shape == whole.y.shape
     assert found.squares.shape == (n, data.noise_model.bodies)
+    assert found.count == data.y.numel()
     scale = float(found.errors.abs().max())
     for row in range(0, n, 5):
         others = torch.tensor([k for k in range(n) if k != row])
@@ -168,7 +169,8 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
         rest = torch.cat([torch.arange(m * row), torch.arange(m * (row + 1), m * n)])
         mu = dense.mu(data.target[others]).flatten()
         error = data.target[row] - G[own][:, rest] @ mu
-        assert_close(found.errors[row], error, rtol=0, atol=1e-8 * scale)
+        of_row = whole.rows(torch.tensor([row]))
+        assert_close(found.errors[row], of_row.in_coordinates(error[None])[0], rtol=0, atol=1e-8 * scale)
         cross = G[rest][:, own]
         explained = cross.mT @ torch.cholesky_solve(cross, dense.factor)
         covariance = G[own, own] - explained + noise[row]
@@ -181,7 +183,7 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
 def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
     """The trace of the matrix that makes fitted values from measured ones."""
     case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned()
+    data = case.conditioned().told
     G, total = data.linearisation(case.scales).gram(), data.covariance_terms(case.scales).matrix()
     expected = float(torch.linalg.solve(total, G).trace())
     assert leave_one_out(data, case.scales).effective == pytest.approx(expected, rel=1e-6)

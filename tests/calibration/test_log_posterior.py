@@ -46,10 +46,13 @@ def log_density(matrix: Tensor, target: Tensor) -> float:
 @pytest.mark.parametrize("seed", [2])
 def test_posterior_is_likelihood_times_prior(setting: Setting, seed: int) -> None:
     scales, data = shaken(setting.scales, seed), weighted(setting, seed)
-    nominal, theta, x = data.nominal, data.theta, data.x
+    nominal, theta, x = data.told.nominal, data.theta, data.x
     total = tangent_covariance(scales, nominal, theta, x)
     total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
     target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()
+    if data.basis is not None:  # six numbers of every pose
+        basis = torch.block_diag(*data.basis)
+        total, target = basis.T @ total @ basis, basis.T @ target
     found = log_posterior(scales.logarithms(), setting.scales, data)
     assert found is not None
     assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)

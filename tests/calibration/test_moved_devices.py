@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, ur10_measurements
+from product_bank import Case, simulated, simulated_poses, ur10_measurements
 from reading_bank import scales
-from tangent_bank import Setting, normal
+from tangent_bank import Setting, built, normal
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, find_change_point
+from diffeo_calib.calibration.diagnostics.moved_devices import causes_of, chance_of_jump, find_change_point, findings
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots import SimulatedArm
 
@@ -89,6 +90,21 @@ def test_the_gain_is_that_of_the_definition() -> None:
         assert best.gain == pytest.approx(max(gains), rel=1e-5)
 
 
+def test_errors_that_the_scales_understate_are_no_evidence() -> None:
+    """Gains relative to what is unexplained: errors of ten times the size gain as much, those of a tenth less."""
+    setting = built("two markers")
+    data, order = setting.tangent_data, torch.arange(14)
+    dense = data.factorised(setting.scales)
+
+    def gains(factor: float) -> Tensor:
+        y = data.y + (factor - 1.0) * data.target
+        found = findings(causes_of(data), dense, data.with_measured(y), order)
+        return torch.tensor([one.point.gain for one in found], dtype=torch.float64)
+
+    assert_close(gains(1000.0), gains(100.0), rtol=1e-6, atol=0)
+    assert float((gains(1e-2) / gains(100.0)).max()) < 0.1
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:wrist_3_joint")
 @pytest.mark.filterwarnings("ignore:the place of the marker on 'ee_link' is known to")
@@ -106,9 +122,14 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
 
 def told(arm: SimulatedArm, q: Tensor, points: Tensor, *, given: bool = True) -> str | None:
     """What is said of changes in these rows, with scales given or selected."""
+    return said(arm.nominal, dc.Measurements(q, points), given=given)
+
+
+def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | None:
+    """The same of any rows."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales() if given else None)
+        dc.calibrate(robot, data, hyperparameters=scales() if given else None)
     texts = [str(one.message) for one in caught]
     return next((text for text in texts if "seems to" in text), None)
 
@@ -141,6 +162,22 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
     assert found is not None, drift
     assert float(found[1]) == pytest.approx(0.5, rel=0.2)
     assert told(arm, q, points) is None
+
+
+def test_a_scale_that_changes_is_seen_in_poses() -> None:
+    """It moves poses apart and turns none. 2000 ppm from row 30 of 80 on."""
+    arm, data, _ = simulated_poses(80)
+    assert data.poses is not None
+    poses = data.poses.clone()
+    middle = poses[:, :3, 3].mean(0)
+    poses[30:, :3, 3] = middle + 1.002 * (poses[30:, :3, 3] - middle)
+    text = said(arm.nominal, dc.Measurements.from_poses(data.q, poses))
+    assert text is not None
+    found = re.match(r"the scale of the device .* changed by about ([\d.e+]+) ppm.* near row (\d+)", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(2000, rel=0.3)
+    assert int(found[2]) == pytest.approx(30, abs=3)
+    assert said(arm.nominal, data) is None
 
 
 @pytest.mark.slow

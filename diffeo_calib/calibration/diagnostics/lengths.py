@@ -96,17 +96,19 @@ def lengths(
             length. seed: draws the rows where there are too many. limits: what is usual.
     """
     rows, some = data.sample(len(data.x), limits.coordinates, seed)
-    dense, target = some.factorised(usual(scales, limits)), some.target
+    told = some.told
+    dense, target = told.factorised(usual(scales, limits)), told.target
     total, found = float((dense.mu(target) * target).sum()), []
-    for cause in (*_directions(data, limits), *devices()):
-        B = cause.effects[rows]
+    causes = (one._replace(effects=one.effects[rows]) for one in (*_directions(data, limits), *devices()))
+    for cause in causes:
+        B, moved = cause.told_by(some).effects, cause.effects - cause.effects.mean(0)
         W = dense.solve(B)
         h, g = float((B * W).sum()), float((W[..., 0] * target).sum())
         if h <= 0.0:
             continue
-        excess = max(1.0, (total - g**2 / h) / max(some.coordinates, 1))  # of errors that are not usual
+        excess = max(1.0, (total - g**2 / h) / max(told.coordinates, 1))  # of errors that are not usual
         value, deviation = g / h, (excess / h) ** 0.5
-        motion = float((B - B.mean(0))[some.visible].square().mean().sqrt())
+        motion = float(moved[some.visible].square().mean().sqrt())
         chance = chi2_probability((value / deviation) ** 2, 1)
         found.append(Length(cause, value, deviation, abs(value) * motion, chance, (deviation, deviation * motion)))
     allowed = chi2_above(limits.chance / max(len(found), 1), 1) ** 0.5

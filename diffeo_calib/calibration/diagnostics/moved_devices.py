@@ -30,6 +30,7 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence
 from diffeo_calib.common.quantiles import chi2_median, chi2_probability
+from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.se3 import skew
@@ -80,12 +81,18 @@ class Cause(NamedTuple):
         name: in words. effects: (N, m, U) derivatives of all rows by the unknowns, m.
         unit: in which a single unknown is reported, and its size in m or rad; None to report the motion of the points.
         fix: what to do about a sudden change.
+        basis: (N, c, m) the coordinates of the rows' points by their numbers, see :attr:`TangentData.basis`, or None.
     """
 
     name: str
     effects: Tensor
     unit: tuple[str, float] | None = None
     fix: str = NEW_SET_UP
+    basis: Tensor | None = None
+
+    def told_by(self, data: TangentData) -> Cause:
+        """The same with effects on the numbers that the rows tell, of effects on all coordinates."""
+        return self._replace(effects=data.motions_in_numbers(self.effects), basis=data.basis)
 
 
 class ChangePoint(NamedTuple):
@@ -130,7 +137,8 @@ class Finding(NamedTuple):
         """RMS motion of a coordinate by the change over the rows that show it, m."""
         moved = (self.columns @ self.point.change).square().sum(1)
         shown = moved > 0
-        return float((moved[shown].mean() / self.columns.shape[1]).sqrt()) if bool(shown.any()) else 0.0
+        count = self.columns.shape[1] if self.cause.basis is None else self.cause.basis.shape[1]
+        return float((moved[shown].mean() / count).sqrt()) if bool(shown.any()) else 0.0
 
     def chance(self, limits: ChangeLimits) -> float:
         """Probability that chance alone gains as much."""
@@ -151,8 +159,10 @@ class Finding(NamedTuple):
 
     def _moved(self, limits: ChangeLimits) -> tuple[str, float]:
         """What moved, and how far, m."""
-        size = 3 if self.point.motion.shape[1] % 3 == 0 else self.point.motion.shape[1]
-        distances = self.point.motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
+        motion, basis = self.point.motion, self.cause.basis
+        motion = motion if basis is None else (basis @ motion[:, :, None])[:, :, 0]
+        size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
+        distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
         shown = distances.amax(1) > 0
         typical = distances[shown].median(0).values
         if self.cause.name != MARKERS:
@@ -183,14 +193,14 @@ def change_during(
     rows, some = data.sample(len(data.x), limits.coordinates, seed)
     if len(rows) < 4 * limits.fewest_rows:
         return None
-    causes = [one._replace(effects=one.effects[rows]) for one in (*causes_of(data), *devices())]
-    causes = [one for one in causes if bool((one.effects != 0).any())]
-    order, dense = numbers.to(rows.device)[rows].argsort(), some.factorised(scales)
-    ratio = left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)
-    excess = max(1.0, float(ratio.nanmedian()))  # of errors that the scales understate
-    found = findings(causes, dense, some.target, order, excess=excess, limits=limits)
-    noise = float(some.new_noise(scales).diagonal().mean().sqrt())
-    found = [one for one in found if one.displacement > limits.noise_share * noise]
+    least = limits.noise_share * float(some.new_noise(scales).diagonal().mean().sqrt())
+    causes = _on_rows((*causes_of(data), *devices()), rows, some)
+    some, numbers = some.told, numbers.to(rows.device)[rows]
+    order, dense = numbers.argsort(), some.factorised(scales)
+    usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
+    excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
+    found = findings(causes, dense, some, order, excess=excess, limits=limits)
+    found = [one for one in found if one.displacement > least]
     if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
         return None
     best = max(found, key=lambda one: one.evidence)
@@ -198,18 +208,24 @@ def change_during(
     words = dict.fromkeys(one.words(limits) for one in (best, *others))
     before, after = (left_out_rms(known, some.target) for known in (dense, Beside(dense, best.columns)))
     if best.drifts and (moved := moved_twice(best, dense, some.target, order, limits)):
-        lines = " and ".join(str(int(numbers.to(rows.device)[rows[order[row]]])) for row in moved)
+        lines = " and ".join(str(int(numbers[order[row]])) for row in moved)
         what = f"{best.cause.name} seems to have moved more than once, near rows {lines}"
         return sentence(what, expected="one set-up for all rows", fix=f"check what happened then; {best.cause.fix}")
     if after > limits.worth * before:
         return None
-    where = "over the rows" if best.drifts else f"near row {int(numbers.to(rows.device)[rows[order[best.point.row]]])}"
+    where = "over the rows" if best.drifts else f"near row {int(numbers[order[best.point.row]])}"
     return sentence(
         f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
         expected="one set-up for all rows, in the order of their numbers",
         got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
         fix=SLOW if best.drifts else f"check what happened then; {best.cause.fix}",
     )
+
+
+def _on_rows(causes: Iterable[Cause], rows: Tensor, some: TangentData) -> list[Cause]:
+    """Those that move some of the rows, with effects on the numbers that these tell."""
+    own = [one._replace(effects=one.effects[rows]) for one in causes]
+    return [one.told_by(some) for one in own if bool((one.effects != 0).any())]
 
 
 class Beside:
@@ -258,21 +274,27 @@ def _as_good(one: Finding, best: Finding, limits: ChangeLimits) -> bool:
 def findings(
     causes: Iterable[Cause],
     dense: CholeskyRegression,
-    target: Tensor,
+    data: TangentData,
     order: Tensor,
     *,
     excess: float = 1.0,
     limits: ChangeLimits = LIMITS,
 ) -> list[Finding]:
-    """Every cause at its best change point, and drifting; ``excess`` divides the gains."""
-    found = []
+    """Every cause at its best change point, and drifting.
+
+    Gains are divided by ``excess``, or by the mean square of what the cause leaves unexplained where that is larger.
+    """
+    found, target = [], data.target
+    total, count = float((dense.mu(target) * target).sum()), max(data.coordinates, 1)
+
+    def judged(point: ChangePoint) -> ChangePoint:
+        return point._replace(gain=point.gain / max(excess, (total - point.gain) / count))
+
     for cause in causes:
         jump = find_change_point(cause.effects, dense, target, order, limits.fewest_rows)
-        columns = _from_row(cause.effects, order, jump.row)
-        found.append(Finding(cause, jump._replace(gain=jump.gain / excess), False, columns))
+        found.append(Finding(cause, judged(jump), False, _from_row(cause.effects, order, jump.row)))
         columns = evenly_growing(cause.effects, order)
-        drift = _drift(cause.effects, columns, dense, target)
-        found.append(Finding(cause, drift._replace(gain=drift.gain / excess), True, columns))
+        found.append(Finding(cause, judged(_drift(cause.effects, columns, dense, target)), True, columns))
     return found
 
 
@@ -324,6 +346,8 @@ def causes_of(data: TangentData) -> list[Cause]:
     """What may change of robot, tool and measuring frame, and its effects on all rows."""
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
     base, markers = _base_motions(points), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
+    if data.basis is not None:  # nothing bends a frame
+        markers = markers @ torch.block_diag(*rigid_motions(geometry.tool.flatten()).to(markers.device))
     if data.slopes is not None:
         base, markers = data.slopes @ base, data.slopes @ markers
     kinds = data.noise_model.row_kinds

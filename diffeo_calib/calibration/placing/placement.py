@@ -207,7 +207,7 @@ class Placement:
         """
         if not self.sets:
             return self
-        shifts, joint = fitted.shifts, cache(lambda: _covariance(fitted_map, fitted.problem.noise))
+        shifts, joint = fitted.shifts, cache(lambda: _covariance(fitted_map, fitted.model.noise))
         found, start = [], 0
         for own in self.sets:
             part = slice(start, start + own.size)

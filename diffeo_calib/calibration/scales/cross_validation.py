@@ -202,8 +202,9 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, parts: list[Ten
     Returns:
         (N, bodies); NaN for hidden markers, and for rows of no part.
     """
+    new, data = data.blocks_in_numbers(noise_of_new_rows(data, scales)), data.told
     m, dense, own = data.y.shape[1], data.factorised(scales), data.weighted_noise(scales)
-    inverse, mu, new = dense.inverse, dense.mu(data.target).flatten(), noise_of_new_rows(data, scales)
+    inverse, mu = dense.inverse, dense.mu(data.target).flatten()
     moments, predicted = own * nan, own.clone()
     for rows in parts:
         index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()

@@ -76,7 +76,7 @@ def find_gear_lines(
     """
     if data.coordinates < limits.per_scale * len(scales.logarithms()):
         return ()
-    _, data = data.sample(len(data.x), limits.coordinates, seed)
+    data = data.sample(len(data.x), limits.coordinates, seed)[1].told
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
     scan = _Scan(data, scales, limits)
     found: list[GearLine] = []

@@ -44,11 +44,18 @@ class LeaveOneOut:
         squares: (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well.
         effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block
             is the whole fit.
+        numbers: how many were measured; those of the errors by default. A pose has six, its three points nine errors.
     """
 
     errors: Tensor
     squares: Tensor
     effective: float | None
+    numbers: int | None = None
+
+    @property
+    def count(self) -> int:
+        """How many numbers were measured."""
+        return len(known(self.errors)) if self.numbers is None else self.numbers
 
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
@@ -59,7 +66,7 @@ class LeaveOneOut:
         """
         if self.effective is None:
             return 1.0
-        per_row = len(known(self.errors)) / len(self.errors)
+        per_row = self.count / len(self.errors)
         freedom = max(configurations * per_row - self.effective, SMALLEST_FREEDOM)
         return region_factor(freedom, 3)
 
@@ -79,6 +86,7 @@ def estimate_tails(
         rounds: largest number of steps.
         block_coordinates: largest number of measured coordinates of a block.
     """
+    data = data.told
     blocks = [(rows, _Block(part, scales)) for rows, part in _parts(data, seed, block_coordinates)]
     tails = data.tails
     for _ in range(rounds):
@@ -97,6 +105,7 @@ def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> 
     The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
     weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
     """
+    data = data.told
     squares = torch.empty_like(data.tails.weights)
     blocks = random_blocks(data, seed, BLOCK_COORDINATES)
     for rows in blocks:
@@ -121,13 +130,14 @@ def leave_one_out(
     data: TangentData, scales: Hyperparameters, seed: int = 0, *, block_coordinates: int = BLOCK_COORDINATES
 ) -> LeaveOneOut:
     """Leave-one-out errors in closed form; arguments as of :func:`estimate_tails`."""
-    errors, squares = torch.empty_like(data.y), torch.empty_like(data.tails.weights)
+    told = data.told
+    errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
     effective = []
-    for rows, part in _parts(data, seed, block_coordinates):
+    for rows, part in _parts(told, seed, block_coordinates):
         errors[rows], squares[rows], number = _left_out(part, scales)
         effective.append(number)
-    errors = errors.masked_fill(~data.visible, nan)
-    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
+    errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
+    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
 
 
 def random_blocks(data: TangentData, seed: int, coordinates: int) -> list[Tensor]:

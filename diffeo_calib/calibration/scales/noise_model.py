@@ -101,6 +101,23 @@ class NoiseModel:
         return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
 
     @property
+    def rigid_basis(self) -> Tensor | None:
+        """(N, R, 6 B) orthonormal columns, all motions of rigid poses; None unless all bodies are poses.
+
+        Errors of poses, and what moves them, are such motions: the other numbers of their points tell nothing.
+        """
+        if self.modes is None or self.modes.shape[1:3] != (self.bodies, self.size) or self.size <= FREEDOM_OF_POSES:
+            return None
+        return block_diagonal(torch.linalg.qr(self.modes).Q)
+
+    def along(self, basis: Tensor) -> NoiseModel:
+        """That of six numbers of every pose, those of :attr:`rigid_basis`."""
+        modes = None if self.modes is None else torch.linalg.qr(self.modes).Q.mT @ self.modes
+        known = None if self.known is None else basis.mT @ self.known @ basis
+        visible = None if self.seen is None else self.seen.repeat_interleave(FREEDOM_OF_POSES, 1)
+        return replace(self, size=FREEDOM_OF_POSES, modes=modes, known=known, visible=visible)
+
+    @property
     def kind_count(self) -> int:
         """Kinds of devices."""
         return 1 if self.kinds is None else int(self.kinds.max()) + 1

@@ -161,7 +161,7 @@ def log_posterior(
     Returns:
         None where G + R, or the noise by itself, is not positive definite in float64.
     """
-    point = logarithms.detach().clone().requires_grad_()
+    data, point = data.told, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         terms = data.covariance_terms(centre.from_logarithms(point), data.present)
     try:
@@ -249,7 +249,7 @@ def log_likelihood(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None
         return -float("inf"), None
     mu = torch.cholesky_solve(target[:, None], factor)[:, 0]
     value = -0.5 * float(target @ mu) - float(factor.diagonal().log().sum()) - 0.5 * len(target) * log(2 * pi)
-    return value, 0.5 * (torch.outer(mu, mu) - torch.cholesky_inverse(factor))
+    return value, torch.cholesky_inverse(factor).addr_(mu, mu, beta=-0.5, alpha=0.5)
 
 
 LARGEST_AMPLITUDE_RATIO = 3.0

@@ -22,11 +22,11 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.maps.observation import Observation
+from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
@@ -126,6 +126,55 @@ class TangentData:
             return int(freedom[seen].sum())
         return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
 
+    # --- poses as six numbers ---
+
+    @cached_property
+    def basis(self) -> Tensor | None:
+        """(N, m, r) orthonormal columns of the numbers of :attr:`told`; None where these are those of the rows."""
+        return None if self.observe is not None else self.noise_model.rigid_basis
+
+    @cached_property
+    def told(self) -> TangentData:
+        """The same rows with all that they tell: of every pose six numbers, m, for nine coordinates of its points.
+
+        The points of a measured pose are exactly rigid, and those of k0 are. Only psi would bend them, by less than the
+        slack of the noise model, so that the other three numbers hardly say anything; matrices are 2.25 times as large
+        with them, and their factors 3.4 times as dear.
+        """
+        basis = self.basis
+        if basis is None:
+            return self
+        to = basis.mT
+        shared = None if self.shared is None else to @ self.shared
+        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
+        observe, nominal = LinearFunctionals(to, to.new_zeros(to.shape[:2])), self.nominal.with_rigid_frames()
+        other = replace(self, **numbers, observe=observe, nominal=nominal)
+        vars(other).update(points=self.points, jacobian=to @ self.jacobian)
+        return other
+
+    def in_numbers(self, values: Tensor) -> Tensor:
+        """Values of all coordinates (N, m) as those of :attr:`told`: (N, r)."""
+        return values if self.basis is None else (self.basis.mT @ values[:, :, None])[:, :, 0]
+
+    def in_coordinates(self, numbers: Tensor) -> Tensor:
+        """The inverse of :meth:`in_numbers`, for rigid motions: (N, r) -> (N, m)."""
+        return numbers if self.basis is None else (self.basis @ numbers[:, :, None])[:, :, 0]
+
+    def blocks_in_numbers(self, blocks: Tensor) -> Tensor:
+        """Covariances of all coordinates (N, m, m) as those of :attr:`told`: (N, r, r)."""
+        return blocks if self.basis is None else self.basis.mT @ blocks @ self.basis
+
+    def motions_in_numbers(self, motions: Tensor) -> Tensor:
+        """Derivatives of all coordinates (N, m, U) in those of :attr:`told` (N, r, U), less what bends poses of k0.
+
+        What bends it would look like a turn where the measured pose is turned against k0: by the very error of the row.
+        """
+        if self.basis is None:
+            return motions
+        rigid = rigid_motions(self.points)
+        kept = rigid @ (rigid.mT @ motions.unflatten(1, (-1, rigid.shape[2])))
+        return self.basis.mT @ kept.flatten(1, 2)
+
     # --- parts and variants, which share the linearisation ---
 
     def rows(self, index: Tensor) -> TangentData:
@@ -163,6 +212,9 @@ class TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)
         vars(other)["_last_gram"] = vars(self).get("_last_gram")
+        told = vars(self).get("told")
+        if told is not None and told is not self:
+            vars(other).update(basis=self.basis, told=told.with_tails(tails))
         return other
 
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
@@ -372,10 +424,10 @@ def observed_task_gram(task: Tensor, slopes: Tensor) -> Tensor:
     """A kappa A^T: kappa (N P, N P) of points on R^3, slopes A (N, r, 3 P) -> (N r, N r)."""
     (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))  # (N, r, P, 3)
     P = each.shape[2]
-    single = each.transpose(1, 2).flatten(0, 1)  # (N P, r, 3)
-    values = task[:, None].expand(-1, 3, -1)
-    found = diagonal_gram(values, single, slopes)  # (N P r, N r)
-    return found.reshape(N, P, r, N * r).sum(1).view(N * r, N * r)
+    right = each.permute(0, 2, 3, 1).reshape(N, P, 3 * r)
+    half = task.view(N * P, N, P).transpose(0, 1) @ right  # (N, N P, 3 r), the first N of the right
+    half = half.view(N, N, P, 3, r).permute(1, 2, 3, 0, 4).reshape(N, 3 * P, N * r)
+    return (slopes @ half).view(N * r, N * r)
 
 
 def task_weights(weights: Tensor, slopes: Tensor) -> Tensor:

@@ -30,7 +30,6 @@ from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
-from diffeo_calib.common.quantiles import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
@@ -275,7 +274,7 @@ def _solver_lines(result: CalibrationResult) -> Iterator[str]:
     """How many parameters the fit has, and how well it solves its equations."""
     left_out, fitted = result.leave_one_out, result.fit
     if left_out.effective is not None:
-        yield f"effective number of parameters: {left_out.effective:.0f} of {len(known(left_out.errors))} coordinates"
+        yield f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates"
     yield (
         f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
         f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
