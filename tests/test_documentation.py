@@ -7,21 +7,16 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import get_ur10_data
 import pytest
 from command_bank import Command
-from product_bank import simulated, simulated_poses
-from trackerless_bank import write_socket_table, write_wire_table
+from documentation_bank import commands, shown_outputs, words, write_tables
 from typer import Context
 from typer.main import get_command
 
 from diffeo_calib.cli.main import app
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 
 ROOT = Path(__file__).parents[1]
 README, PAGES = ROOT / "README.md", ROOT / "scripts/docs/pages"
@@ -40,35 +35,11 @@ def snippets(text: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-def commands(text: str) -> list[str]:
-    found = re.findall(r"^    (diffeo-calib (?:.*\\\n)*.*)$", text.replace("\\\n", " "), re.MULTILINE)
-    return [" ".join(command.split()) for command in found]
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated arm and tables of its measurements under the names of the documentation."""
     place = tmp_path_factory.mktemp("documentation")
-    arm, train, test = simulated(40)
-    arm.write_urdf(place / "robot.urdf")
-    names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
-    for name, data in (
-        ("measurements", train),
-        ("other", test[:60]),
-        ("joints", test[:60]),
-        ("program", test[:40]),
-        ("new", test[:15]),
-        ("check", test[15:40]),
-    ):
-        write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
-    write_socket_table(place / "block.csv", arm, "01", 0)
-    write_wire_table(place / "wire.csv", arm, 0)
-    posed = simulated_poses(30)[1]
-    rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
-    write_measurements(place / "poses.csv", posed, rotation)
-    source = os.environ.get("DIFFEO_CALIB_DATA")
-    if source:
-        get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
+    write_tables(place)
     return place
 
 
@@ -137,6 +108,8 @@ def test_commands_run_one_after_the_other(folder: Path, command: Command, monkey
         r"632 poses; ([0-9.]+) mm RMS on the held-out rows of this split, geometry ([0-9.]+)", "".join(texts().values())
     )
     assert found is not None
+    shown = {line: output for text in texts().values() for line, output in shown_outputs(text).items()}
+    assert len(shown) >= 12
     ran = 0
     for line in dict.fromkeys(whole):
         program, *arguments = shlex.split(line)
@@ -148,8 +121,10 @@ def test_commands_run_one_after_the_other(folder: Path, command: Command, monkey
             continue
         done = command(*arguments)
         assert done.code == 0, (line, done.err)
+        printed = {words(each) for each in f"{done.out}\n{done.err}".splitlines()}
+        assert not [each for each in shown.get(line, []) if words(each) not in printed], line
         if real:
-            rms = [done.numbers(stage, "190 held out")[0] for stage in ("diffeomorphic", "geometry")]
+            rms = [done.numbers(stage, "190 held out")[0] for stage in ("calibrated", "geometric")]
             assert [f"{value:.3f}" for value in rms] == [found[1], found[2]]
         ran += 1
     assert ran >= 18

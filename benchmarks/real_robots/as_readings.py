@@ -107,7 +107,7 @@ def compared(robot: RobotData, train: dc.Measurements, test: dc.Measurements, co
         result = dc.calibrate(robot.robot, data)
         seconds = time.process_time() - begin
         record = common | {"case": case, "rows": len(rows)}
-        for stage in ("nominal + registration", "geometry"):
+        for stage in ("nominal", "geometric"):
             yield record | {"stage": stage} | judged(result.stages[stage], test)
         yield record | {"stage": "full", "seconds": seconds} | judged(result.model, test)
 

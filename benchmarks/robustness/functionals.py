@@ -210,7 +210,7 @@ def by_readings(name: str, noise: float, seed: int, count: int) -> Iterator[Reco
         q = q + (torch.linalg.pinv(slopes) @ (noise * draws)[:, :, None])[:, :, 0]
     result = dc.calibrate(arm.nominal, case.readings(q, values, which))
     record: Record = {"case": name, "noise_mm": 1e3 * noise, "seed": seed, "rows": len(q)}
-    for method, stage in (("nominal", "nominal + registration"), ("geometry", "geometry")):
+    for method, stage in (("nominal", "nominal"), ("geometry", "geometric")):
         yield record | {"method": method} | judged(arm, seed, result.stages[stage])
     fresh, there, values = rows_of(arm, case, HELD_OUT, seed + 200)
     (devices,), rows = result.places().devices.values(), case.readings(fresh, values, there)

@@ -3,7 +3,7 @@
     1 registration   base frame and markers, or ball and devices
     2 geometry       an error twist before every joint, with a prior; outliers lose their influence
     3 scales         of kernels, priors and noise, by marginal likelihood; then the weights of outliers, and again
-    4 diffeomorphic  phi, psi, geometry, gravity sag and devices together, fitted exactly
+    4 calibrated     phi, psi, geometry, gravity sag and devices together, fitted exactly
 
 Each stage is kept in the result, so that a report can compare them.
 """
@@ -14,7 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -41,7 +41,7 @@ from diffeo_calib.calibration.scales.of_models import check_models
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, as_written, few
+from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -157,31 +157,33 @@ def calibrate(
     check_seed(seed)
     check_controls(controls, measurements)
     check_joints(robot, measurements)
-    placed = place(robot, measurements, progress)
-    check_limits(robot, measurements)
-    data = placed.tangent_data()
-    check_not_nominal(robot, data, placed.registration, placed.identification)
-    _warn_of_what_is_open(robot, placed, data)
-    stages = placed.registration, placed.identification
-    choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
-    chosen = choose(data, measurements, *stages)
-    drifting = placed.drifting()
-    if drifting is not None:
-        again = choose(drifting.tangent_data(), measurements, *stages)
-        placed, chosen = (drifting, again) if worth_it(chosen.left_out, again.left_out) else (placed, chosen)
-    LOG.info("scales: %s", chosen.selection.status)
-    fitted = _fit(chosen, controls, backend, progress)
-    return _result(robot, placed, chosen, fitted, note)
+    with kept_warnings() as warned:
+        placed = place(robot, measurements, progress)
+        check_limits(robot, measurements)
+        data = placed.tangent_data()
+        check_not_nominal(robot, data, placed.registration, placed.identification)
+        _warn_of_what_is_open(robot, placed, data)
+        stages = placed.registration, placed.identification
+        choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
+        chosen = choose(data, measurements, *stages)
+        drifting = placed.drifting()
+        if drifting is not None:
+            again = choose(drifting.tangent_data(), measurements, *stages)
+            placed, chosen = (drifting, again) if worth_it(chosen.left_out, again.left_out) else (placed, chosen)
+        LOG.info("scales: %s", chosen.selection.status)
+        fitted = _fit(chosen, controls, backend, progress)
+        return _result(robot, placed, chosen, fitted, note=note, warned=warned)
 
 
-def _lengths(placed: Placed, chosen: ChosenScales) -> list[Length]:
-    """Lengths against the robot's description; a warning of one that is too improbable."""
+def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float | None]:
+    """Lengths against the robot's description, and by how much one that is too improbable moves points, m."""
     data = chosen.data
     found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(seen_rows(data)))
     worst = doubtful(found)
-    if worst is not None:
-        warn_of_length(worst)
-    return found
+    if worst is None:
+        return found, None
+    warn_of_length(worst)
+    return found, worst.displacement * 3**0.5
 
 
 def _change(placed: Placed, chosen: ChosenScales) -> str | None:
@@ -234,7 +236,9 @@ def _covariances(fitted: FittedMap, placed: Placed) -> FittedMap:
     return fitted.without_rigid_motions() if placed.free else fitted
 
 
-def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note: str) -> CalibrationResult:
+def _result(
+    robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, *, note: str, warned: list[str]
+) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
     fitted_map = _covariances(fitted.model, placed)
     placed = placed.settled(fitted, fitted_map, chosen)
@@ -247,12 +251,13 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     changed = placed.mislabelled(model, found) or _change(placed, chosen)
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
+    found_lengths, doubt = _lengths(placed, chosen)
     rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
             fitted_map,
-            _summary(rms, chosen, fitted, explained, found),
+            _summary(rms, chosen, fitted, explained, found, length_in_doubt=doubt, warnings="\n".join(warned) or None),
             lever=placed.lever,
             ball=placed.ball,
             placement=placed.placement.placed(),
@@ -267,19 +272,24 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
         parts=explained,
         outliers=found,
         fit=fitted,
-        lengths=_lengths(placed, chosen),
+        lengths=found_lengths,
     )
 
 
 def _summary(
-    rms: list[float | None], chosen: ChosenScales, fitted: Fit, explained: list[Part], found: list[Outlier]
+    rms: list[float | None],
+    chosen: ChosenScales,
+    fitted: Fit,
+    explained: list[Part],
+    found: list[Outlier],
+    **warned: Any,
 ) -> Summary:
     """Numbers and sentences that travel with the model; ``rms`` of registration, geometry, model and left out, m."""
-    registration, geometry, diffeomorphic, left_out = rms
+    registration, geometry, calibrated, left_out = rms
     return Summary(
         registration_rms=registration,
         geometry_rms=geometry,
-        diffeomorphic_rms=diffeomorphic,
+        diffeomorphic_rms=calibrated,
         leave_one_out_rms=left_out,
         outliers=len(found),
         noise_degrees_of_freedom=chosen.data.tails.freedom,
@@ -291,4 +301,5 @@ def _summary(
         rows=len(chosen.data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
+        **warned,
     )

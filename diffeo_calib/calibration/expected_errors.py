@@ -17,7 +17,7 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import hypot
 from typing import Any
 
@@ -98,22 +98,21 @@ class ExpectedError:
         measured = _distance(shown @ fitted.posterior(fitted.x[rows], noise=False)[1] @ shown.mT)
         away = points[:, -3:] - points[:, -3:].mean(0)
         share = min(size * _length(away) / max(expected, 1e-12), 1.0)
-        return cls(expected, whole, measured, found.names_on(model), size, share)
-
-    def in_doubt(self, distance: float) -> ExpectedError:
-        """The same where a length in doubt moves points by a distance, m."""
-        wider = {name: hypot(getattr(self, name), distance) for name in ("workspace", "whole")}
-        return replace(self, **wider, doubt=distance)
+        doubt = 0.0 if model.summary is None else model.summary.length_in_doubt or 0.0
+        wider = hypot(expected, doubt), hypot(whole, doubt)
+        return cls(*wider, measured, found.names_on(model), size, share, doubt)
 
     @property
     def sentence(self) -> str:
         """How large it is, and what it leaves out."""
         text = f"{1e3 * self.workspace:.3f} mm RMS"
+        if self.doubt:
+            settled = max(self.workspace**2 - self.doubt**2, 0.0) ** 0.5
+            text = f"{text}, with the length in doubt ({1e3 * settled:.3f} mm if it is right as given)"
         if self.open_places:
             what = f"{' and '.join(self.open_places)}, which the rows leave open"
             text = f"{text} apart from {what} ({1e3 * self.whole:.3f} mm with it)"
-        doubt = f", {1e3 * self.doubt:.3f} mm of it by the length in doubt" * (self.doubt > 0)
-        return f"{text}{doubt}; {1e3 * self.measured:.3f} mm at the poses of the fit"
+        return f"{text}; {1e3 * self.measured:.3f} mm at the poses of the fit"
 
     def entry(self) -> dict[str, object]:
         """For programs."""
@@ -122,6 +121,7 @@ class ExpectedError:
             "with_open_places_m": self.whole,
             "at_rows_of_fit_m": self.measured,
             "open_places": list(self.open_places),
+            "length_in_doubt_m": self.doubt,
             "size_deviation": self.size,
         }
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful
+from diffeo_calib.calibration.diagnostics.lengths import Length
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
@@ -31,8 +31,8 @@ from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import with_positions
 
-STAGES = "nominal + registration", "geometry", "diffeomorphic"
-"""Names of the stages of a calibration."""
+STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
+"""The stages of a calibration: base and markers only, with an error of every joint, and the model."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -111,8 +111,7 @@ class CalibrationResult:
     @cached_property
     def expected(self) -> ExpectedError:
         """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
-        found, worst = ExpectedError.of(self.model), doubtful(self.lengths)
-        return found if worst is None else found.in_doubt(worst.displacement * 3**0.5)
+        return ExpectedError.of(self.model)
 
     def aligned(self, data: Any) -> Any:
         """Rows of the same sessions in the frame of the model; those without positions, and of one session, stay."""

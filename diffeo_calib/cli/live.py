@@ -46,6 +46,7 @@ class Live:
         waiting: those that were there at the start and were not. ids: number of the line of each id.
         said: whether each row is accepted, and to be repeated. unreadable: lines that are no rows, and why.
         revised: rows that the last line changed. late: rows that a new model changed, not told yet.
+        ignored: lines after the one with which the target was reached.
     """
 
     campaign: Campaign
@@ -62,6 +63,7 @@ class Live:
     unreadable: dict[int, str] = field(default_factory=dict)
     revised: list[int] = field(default_factory=list)
     late: list[int] = field(default_factory=list)
+    ignored: int = 0
     _found: tuple[object, Next | None] | None = None
 
     def __post_init__(self) -> None:
@@ -109,6 +111,7 @@ class Live:
             number = self._add(line)
             self._say(self.answer(number) | ({} if left or self.campaign.reached else self.state()))
             if self.campaign.reached:
+                self.ignored = left
                 return
 
     def poll(self) -> bool:

@@ -138,12 +138,14 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     )
 
 
-def motion_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
-    """Where measuring frame and markers are now, and how far from where they were."""
+def motion_lines(found: Registration, tips: Sequence[str], *, robot_changed: bool = False) -> Iterator[str]:
+    """Where measuring frame and markers are now, and how far from where they were, as if the robot had not changed."""
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
         yield from _marker_lines(found, tips)
+    if robot_changed:
+        yield "  these places were found as if the robot had not changed: a part of the change below is in them"
 
 
 def frame_lines(found: Registration) -> Iterator[str]:

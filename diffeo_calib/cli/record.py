@@ -26,7 +26,7 @@ from diffeo_calib.common.files import IMAGE_SUFFIXES, check_writable, write_whol
 if TYPE_CHECKING:
     from diffeo_calib.sensors.errors import Evaluation
 
-VERSION = 2
+VERSION = 3
 """Of the format. Entries may be added to one version; none is removed or changes its meaning."""
 FORMAT = "diffeo_calib result"
 OPTION = "--json"
@@ -39,7 +39,7 @@ class Record:
     def __init__(self) -> None:
         self.path: Path | None = None
         self._results: dict[str, Any] = {}
-        self._warnings: list[str] = []
+        self.warnings: list[str] = []
         self._depth = 0
 
     def add(self, **results: Any) -> None:
@@ -53,13 +53,13 @@ class Record:
 
     def warn(self, text: str) -> None:
         """Add a warning."""
-        self._warnings.append(text)
+        self.warnings.append(text)
 
     @contextmanager
     def written(self, arguments: list[str]) -> Iterator[None]:
         """Write the file, if it is wanted, when the outermost command inside has ended."""
         if self._depth == 0:
-            self.path, self._results, self._warnings = None, {}, []
+            self.path, self._results, self.warnings = None, {}, []
         self._depth += 1
         code, error = 0, None
         try:
@@ -92,7 +92,7 @@ class Record:
             "arguments": arguments,
             "exit_code": code,
             "error": error,
-            "warnings": self._warnings,
+            "warnings": self.warnings,
             "results": self._results,
         }
         return json.dumps(_plain(made), indent=2, allow_nan=False, ensure_ascii=False) + "\n"

@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from math import inf
 from reprlib import Repr
 from typing import TYPE_CHECKING
 
@@ -62,8 +65,26 @@ class DiffeoCalibWarning(UserWarning):
     """Something looks wrong, but a result is still returned."""
 
 
+_KEPT: ContextVar[list[str] | None] = ContextVar("kept", default=None)
+"""Where texts of warnings are kept too."""
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """A list to which the text of every warning of :func:`warn_user` inside is added, however warnings are filtered."""
+    texts = list[str]()
+    before = _KEPT.set(texts)
+    try:
+        yield texts
+    finally:
+        _KEPT.reset(before)
+
+
 def warn_user(text: str) -> None:
     """Issue a :class:`DiffeoCalibWarning` that points at the line outside this package which led here."""
+    kept = _KEPT.get()
+    if kept is not None:
+        kept.append(printable(text))
     level, frame = 1, sys._getframe()
     skipped = PACKAGE, "contextlib"  # which the decorators of threads.py come from
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in skipped:
@@ -116,6 +137,15 @@ def shown(value: object, most: int = LONGEST_NAME) -> str:
     text = printable(value if isinstance(value, str) else " ".join(str(value).split()))
     half = (most - 3) // 2
     return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
+
+
+def with_deviation(value: float, deviation: float) -> str:
+    """A signed value with as many digits as its deviation tells: ``+1.000 +- 0.004``, ``-12 +- 3``."""
+    if not 0.0 < deviation < inf:
+        return f"{value:+.2g} +- {deviation:.2g}"
+    leading = f"{deviation:.1e}"  # 1.4e-03: two digits of a deviation that begins with 1
+    digits = max(0, (leading[0] == "1") - int(leading[4:]))
+    return f"{value:+.{digits}f} +- {deviation:.{digits}f}"
 
 
 def printable(text: str) -> str:

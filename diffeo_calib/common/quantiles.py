@@ -52,6 +52,15 @@ def f_below(probability: float, upper: float, lower: float) -> float:
     return float(fdtri(upper, lower, probability))
 
 
+def binomial_band(count: int, share: float, chance: float) -> tuple[int, int]:
+    """The successes of ``count`` trials of probability ``share``: fewer, or more, have at most this chance each."""
+    from scipy.special import bdtr  # noqa: PLC0415  # see above
+
+    at_most = bdtr(np.arange(count + 1), count, share)
+    at_least = 1.0 - np.concatenate([[0.0], at_most[:-1]])
+    return int((at_most > chance).argmax()), int(np.flatnonzero(at_least > chance)[-1])
+
+
 def largest_known(values: Tensor, dim: int = 1) -> Tensor:
     """Largest value along an axis, NaN left out; NaN where there is nothing else."""
     found = values.nan_to_num(-inf, posinf=inf).amax(dim)

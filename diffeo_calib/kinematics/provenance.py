@@ -110,11 +110,13 @@ ENTRIES: dict[str, tuple[str, type]] = {
     "scales": ("scales", str),
     "rows": ("rows", int),
     "effective_parameters": ("effective parameters", float),
+    "length_in_doubt": ("length in doubt [m]", float),
+    "warnings": ("warnings", str),
 }
 """Field of a summary -> its name in dictionaries and model files, and its type."""
 OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
-OPTIONAL = (*OF_POSITIONS, "noise_degrees_of_freedom", "effective_parameters")
-"""Fields that may be None: they have no entry then. The first model files did not have the last two."""
+OPTIONAL = (*OF_POSITIONS, "noise_degrees_of_freedom", "effective_parameters", "length_in_doubt", "warnings")
+"""Fields that may be None: they have no entry then. Old model files do not have the last four."""
 LENGTH_UNIT = " [m]"
 """Ends the names of the parts' entries."""
 INFINITE = "infinite"
@@ -140,6 +142,9 @@ class Summary:
         parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
         noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
         effective_parameters: effective number of parameters of the fit; None if it was not computed.
+        length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, m; None
+            without one.
+        warnings: what the calibration warned of, one line each; None if it did not.
     """
 
     registration_rms: float | None
@@ -156,6 +161,8 @@ class Summary:
     parts: Mapping[str, float]
     noise_degrees_of_freedom: float | None = None
     effective_parameters: float | None = None
+    length_in_doubt: float | None = None
+    warnings: str | None = None
 
     def to_dict(self) -> dict[str, float | int | str]:
         """Entries named with their units, as model files hold them; "infinite" stands for an infinite number."""

@@ -36,6 +36,7 @@ def write_report(
     title: str = "",
     stages: Mapping[str, Kinematics] | None = None,
     places: Mapping[str, Places] | None = None,
+    warnings: Sequence[str] | None = None,
     against: Sequence[str] = (),
     tolerance: float | None = None,
     progress: Progress = silent,
@@ -51,6 +52,7 @@ def write_report(
         stages: name -> kinematics (N, n) -> (N, P, 3) in m to compare, the model last; by default the nominal robot and
             the geometric calibration, base and markers where they fit best.
         places: of devices beside each of these stages; by default they are placed on the rows.
+        warnings: to show first; by default those of the fit.
         against: further columns of the table that errors are shown against. Columns whose names speak of time or
             temperature are shown anyway.
         tolerance: RMS error of positions, m, up to which the robot is good enough: the page says whether it is.
@@ -76,6 +78,8 @@ def write_report(
         words, made = kinds, kinds.sections(found)
     shown_page = page(found, words, made, title, None if data is None else data.sha256)
     shown_page = replace(shown_page, verdict=f"{judged(found, tolerance)}{shown_page.verdict}")
+    if warnings is not None:
+        shown_page = replace(shown_page, warnings=warnings)
     write_whole(path, shown_page.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
@@ -98,10 +102,17 @@ def page(
         title=name,
         subtitle=f"{fit}. Errors: {words.rows_of(found)}.",
         verdict=words.verdict(found),
+        warnings=warnings_of(found.model),
         advice=list(words.advice(found)),
         figures=dict(words.figures(found)),
         sections=[*made, sections.record(found.model, data_sha256 if found.new else None)],
     )
+
+
+def warnings_of(model: CalibratedKinematics) -> list[str]:
+    """What the fit of a model warned of."""
+    summary = model.summary
+    return [] if summary is None or summary.warnings is None else summary.warnings.split("\n")
 
 
 def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:

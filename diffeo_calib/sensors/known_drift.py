@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, with_deviation
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.places import DRIFT, PlacedDevices
@@ -145,4 +145,5 @@ class KnownDrift:
         offsets = zip(self.joints, u[OFFSETS:].tolist(), sd[OFFSETS:].tolist(), strict=True)
         for (name, turns), own, deviation in offsets:
             if abs(own) > SURE * deviation:
-                yield f"the offset of {name} by {1e3 * own:+.2g} +- {1e3 * deviation:.1g} {'mrad' if turns else 'mm'}"
+                size = with_deviation(1e3 * own, 1e3 * deviation)
+                yield f"the offset of {name} by {size} {'mrad' if turns else 'mm'}"

@@ -26,7 +26,7 @@ TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";
 ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
 FORMAT = TableFormat("mm", "deg", ";", ",")
 """That of TABLE."""
-STAGES = ("nominal + registration", "geometry", "diffeomorphic")
+STAGES = ("nominal", "geometric", "calibrated")
 
 UNDRAWN = Picture(f'<svg viewBox="0 0 1 1">{4 * "<path/>"}</svg>', "undrawn")
 """In place of the pictures of a page."""

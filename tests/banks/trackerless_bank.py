@@ -13,11 +13,13 @@ ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
 """(2, 3) Fixed points of the wire in the robot's base frame, m."""
 
 
-def write_socket_table(path: Path, arm: SimulatedArm, sockets: str, seed: int) -> None:
-    """3 places x 2 sockets x 6 rows, the joints in degrees. ``sockets``: their names, a letter each."""
-    rows = rest_in_sockets(arm, seed=seed, places=3, rows=6)
+def write_socket_table(
+    path: Path, arm: SimulatedArm, sockets: str, seed: int, *, places: int = 3, rows: int = 6
+) -> None:
+    """Places x 2 sockets x rows, the joints in degrees. ``sockets``: their names, a letter each."""
+    resting = rest_in_sockets(arm, seed=seed, places=places, rows=rows)
     lines = [",".join(["place", "socket", *arm.nominal.joint_names])]
-    for q, name in zip(rows.q.rad2deg().tolist(), rows.names, strict=True):
+    for q, name in zip(resting.q.rad2deg().tolist(), resting.names, strict=True):
         place, socket = name.split("/")
         lines.append(",".join([f"spot {place}", sockets[int(socket)], *map(repr, q)]))
     path.write_text("\n".join(lines))

@@ -9,12 +9,15 @@ from typing import Any, cast
 import pytest
 import torch
 from again_bank import arm, model, positions
+from product_bank import usual_scales
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.changes import NOISE_FACTORS, SIZES, Change, Changes, likelihood_ratios
-from diffeo_calib.calibration.recalibration.compare import Comparison
+from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison
 from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import weighed
 
 GRAVITY = Change("gravity", 1e-3, angle=False, displacement=1e-3, probability=1e-4)
@@ -53,6 +56,51 @@ def test_errors_that_other_places_explain_are_none() -> None:
         assert float((one.after_placing @ away).norm()) < 0.02 * float(away.norm())
         errors, expected = (float(each.square().mean().sqrt()) for each in (one.placed_residual, one.expected_residual))
         assert 0.4 < errors / expected < 2.5
+
+
+OFFSET = 1e-3
+"""Of a joint, rad."""
+
+
+def with_offset(data: dc.Measurements, joint: int) -> dc.Measurements:
+    """Rows whose encoder of a joint reads too little."""
+    q = data.q.clone()
+    q[:, joint] -= OFFSET
+    return dc.Measurements(q, data.points, data.joint_names)
+
+
+def hidden_in(rows: dc.Measurements) -> tuple[HiddenOffset, ...]:
+    compared = dc.compare(model(positions), rows)
+    assert isinstance(compared, Comparison)
+    return compared.hidden
+
+
+@pytest.mark.parametrize(("joint", "what"), [(0, "device"), (5, "markers")])
+def test_offsets_that_places_hide_are_named(joint: int, what: str) -> None:
+    rows = with_offset(positions(arm(), 24, seed=5), joint)
+    (found,) = hidden_in(rows)
+    assert found.joint == arm().nominal.joint_names[joint]
+    assert found.size == pytest.approx(OFFSET, abs=4 * found.deviation)
+    assert found.deviation < 0.3 * OFFSET
+    assert what in str(found)
+
+
+def test_nothing_is_hidden_where_nothing_moved() -> None:
+    assert hidden_in(positions(arm(), 24, seed=5)) == ()
+
+
+def test_an_offset_between_two_models_is_named() -> None:
+    old, rows = model(positions), positions(arm(), 60, seed=7)
+    for data, joints in ((rows, []), (with_offset(rows, 2), [2])):
+        new = dc.calibrate(arm().nominal, data, hyperparameters=usual_scales(arm().nominal)).model
+        compared = dc.compare(old, new, count=100)
+        assert isinstance(compared, ModelComparison)
+        found = compared.changes.found
+        assert [one.part for one in found] == [f"the offset of {arm().nominal.joint_names[joint]}" for joint in joints]
+        for one in found:
+            assert one.deviation is not None
+            assert one.size == pytest.approx(OFFSET, abs=4 * one.deviation)
+            assert one.part in str(compared)
 
 
 def test_ratios_are_those_of_the_definition() -> None:

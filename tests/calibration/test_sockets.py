@@ -69,7 +69,7 @@ def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(
     truth = arm.true_points(q)[:, 0]
     rms = {name: float(aligned(k(q)[:, 0].detach(), truth).norm(dim=1).square().mean().sqrt())
            for name, k in result.stages.items()}  # fmt: skip
-    assert rms["diffeomorphic"] < 0.4 * rms["geometry"] < 0.3 * rms["nominal + registration"]
+    assert rms["calibrated"] < 0.4 * rms["geometric"] < 0.3 * rms["nominal"]
     mean, covariance = result.model.predict(q, noise=False)
     errors = aligned(mean[:, 0], truth)
     squares = (errors * torch.linalg.solve(covariance[:, 0], errors[..., None])[..., 0]).sum(1)
@@ -86,7 +86,6 @@ def test_the_sockets_are_where_they_are(result: dc.CalibrationResult, rows: Sock
     assert 0.1 < float((errors / found.deviations).square().mean()) < 2.5
     first, second = found.positions[0], found.positions[1]
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
-    assert "2 to 6 times" in found.sentences()[-1]
 
 
 def test_no_rigid_motion_is_left_in_the_covariances(result: dc.CalibrationResult) -> None:

@@ -16,14 +16,14 @@ def test_demo(command: Command, tmp_path: Path) -> None:
     assert (done.code, done.err.strip()) == (0, "")
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png", "report.html"}
-    assert done.numbers("diffeomorphic", "held out")[0] < done.numbers("geometry", "held out")[0]
+    assert done.numbers("calibrated", "held out")[0] < done.numbers("geometric", "held out")[0]
     # the command that it shows is one that works
     shown = re.search(r"  diffeo-calib (fit .*?)\n\n", done.out, re.DOTALL)
     assert shown is not None
     arguments = shown.group(1).replace("\\\n", " ").replace("'", "").split()
     again = command(*arguments[: arguments.index("--figure")])  # figure and report are those of the demo
     assert again.code == 0
-    assert again.numbers("diffeomorphic", "held out") == done.numbers("diffeomorphic", "held out")
+    assert again.numbers("calibrated", "held out") == done.numbers("calibrated", "held out")
 
 
 @pytest.mark.slow

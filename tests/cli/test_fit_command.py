@@ -182,7 +182,7 @@ def test_two_markers(command: Command, tmp_path: Path) -> None:
     done = command("fit", site.csv, *site.robot(), *markers, *table, "-o", path, "--holdout", 0)
     assert (done.code, done.err.strip()) == (0, "")
     evaluated = command("evaluate", path, site.csv, *markers, *table)
-    assert evaluated.numbers("in all") == pytest.approx(done.numbers("diffeomorphic", "training"), abs=1.01e-4)
+    assert evaluated.numbers("in all") == pytest.approx(done.numbers("calibrated", "training"), abs=1.01e-4)
     predicted = command("predict", path, site.csv, *table, "-o", tmp_path / "p.csv")
     assert predicted.code == 0
     header = (tmp_path / "p.csv").read_text().splitlines()[0].split(";")

@@ -148,10 +148,10 @@ def test_ctrl_c_in_a_real_process_writes_the_model(moment: str, tmp_path: Path) 
     assert isinstance(model, dc.CalibratedKinematics)
     _, test = site.data.split(0.7, seed=0)
     done = Outcome(130, out, err)
-    assert done.numbers("diffeomorphic", "24 held out")[0] == pytest.approx(
+    assert done.numbers("calibrated", "24 held out")[0] == pytest.approx(
         1e3 * dc.evaluate(model, test).rms, abs=1.01e-4
     )
-    assert done.numbers("diffeomorphic", "24 held out")[0] < done.numbers("geometry", "24 held out")[0]
+    assert done.numbers("calibrated", "24 held out")[0] < done.numbers("geometric", "24 held out")[0]
 
 
 CUT_SHORT = """

@@ -100,7 +100,7 @@ def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Comma
 def test_fit(folder: Path, command: Command) -> None:
     written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
     assert set(written["errors"]) == {"training", "held_out"}
-    assert written["errors"]["held_out"]["diffeomorphic"]["rows"] == 12
+    assert written["errors"]["held_out"]["calibrated"]["rows"] == 12
     assert set(written["files"]) == {"model", "figure", "report"}
     model = dc.load(folder / "demo" / "model.safetensors")
     torch.testing.assert_close(torch.tensor(written["base"], dtype=torch.float64), model.geometry.base)

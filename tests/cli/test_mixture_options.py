@@ -60,7 +60,7 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     assert "2 to 6 times" not in fitted.out
     results = json.loads((folder / "m.json").read_text())["results"]
     assert len(results["sockets"]["positions_m"]) == 4
-    assert results["errors"]["training"]["diffeomorphic"]["rows"] == 8
+    assert results["errors"]["training"]["calibrated"]["rows"] == 8
     done = command("evaluate", "m.safetensors", "t.csv", *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
     assert done.code == 0, done.err
     assert "3 not used in the fit" in done.out

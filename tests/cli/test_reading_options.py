@@ -47,12 +47,12 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     found = written["results"]
     assert set(found["devices"]["constants"]) == {"A", "B"}
     expected = found["expected_error_by_stage_m"]
-    assert expected["diffeomorphic"] < expected["geometry"] < expected["nominal + registration"]
-    first = f"nominal + registration {1e3 * expected['nominal + registration']:.3f}"
+    assert expected["calibrated"] < expected["geometric"] < expected["nominal"]
+    first = f"nominal {1e3 * expected['nominal']:.3f}"
     assert f"expected absolute error by stage, in mm: {first}" in " ".join(fitted.out.split())
     held_out = found["kinds"]["distance"]["held_out"]
-    assert held_out["diffeomorphic"]["rms"] < held_out["geometry"]["rms"]
-    assert held_out["diffeomorphic"]["unit"] == "mm"
+    assert held_out["calibrated"]["rms"] < held_out["geometric"]["rms"]
+    assert held_out["calibrated"]["unit"] == "mm"
     done = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--json", "e.json")
     assert done.code == 0, done.err
     assert "19 not used in the fit" in done.out
@@ -61,7 +61,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert model.provenance is not None
     assert model.provenance.command.startswith("diffeo-calib fit t.csv")
     rms = json.loads(Path("e.json").read_text())["results"]["kinds"]["distance"]["all"]["rms"]
-    assert 0 < rms < held_out["nominal + registration"]["rms"]
+    assert 0 < rms < held_out["nominal"]["rms"]
     strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
     assert strict.code == 4
     assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0

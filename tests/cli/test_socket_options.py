@@ -40,8 +40,8 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     assert "robot base in the measuring frame" not in fitted.out
     results = json.loads((folder / "m.json").read_text())["results"]
     expected, found = results["expected_error_by_stage_m"], results["sockets"]
-    assert expected["diffeomorphic"] == pytest.approx(found["expected_error_m"])
-    assert expected["diffeomorphic"] < expected["nominal + registration"]
+    assert expected["calibrated"] == pytest.approx(results["expected_error"]["expected_error_m"])
+    assert expected["calibrated"] < expected["nominal"]
     assert len(found["positions_m"]) == 4
     assert 0 < found["left_out_spread_m"] < 2e-3
     units = ["--length", "mm", "--angle", "deg"]

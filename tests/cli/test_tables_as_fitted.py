@@ -92,10 +92,10 @@ def test_no_number_is_cut(width: int, tables: int, site: Site) -> None:
     errors = dc.evaluate(lambda some: data.points, data)
     assert isinstance(errors, Evaluation)
     table = ErrorTable(errors, "by stage", "stage", "rows")
-    table.add(errors, "diffeomorphic", "123 held out")
+    table.add(errors, "calibrated", "123 held out")
     console = Console(width=width, record=True, file=StringIO())
     console.print(table)
     text = console.export_text()
     assert "…" not in text
-    assert text.count("diffeomorphic") == tables
+    assert text.count("calibrated") == tables
     assert text.count("0.0000") == 8

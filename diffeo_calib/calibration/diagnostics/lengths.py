@@ -19,7 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 
 
@@ -72,9 +72,8 @@ class Length(NamedTuple):
 
     def __str__(self) -> str:
         unit, size = self.cause.unit or MILLIMETRE
-        text = (
-            f"{self.cause.name} against its description: {self.value / size:+.2g} +- {self.deviation / size:.2g} {unit}"
-        )
+        found = with_deviation(self.value / size, self.deviation / size)
+        text = f"{self.cause.name} against its description: {found} {unit}"
         least, motion = self.unnoticed
         return (
             f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm; "

@@ -42,7 +42,7 @@ from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import FLATTERY, Sockets
+from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
@@ -203,7 +203,10 @@ class SocketDevices(DeviceSet):
                 for number, sign in ((first, -0.5), (second, 0.5)):
                     effects[self.socket == number, -3:, 0] = sign * along / along.norm()
             first, second, length = block[0]
-            name = f"the distance of '{self.names[first]}' and '{self.names[second]}' ({1e3 * length:.2f} mm)"
+            pair = [self.names[number] for number in (first, second)]
+            if len(block) > 1:  # at several places
+                pair = [name.rpartition(SEPARATOR)[2] for name in pair]
+            name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
             yield Cause(name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix)
 
     def effects(self, data: SeenRows) -> Tensor:
@@ -287,16 +290,14 @@ class SocketDevices(DeviceSet):
         return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
 
     def entry(self) -> dict[str, object]:
-        """Positions by name, spread of places left out, and expected absolute error, for programs; all in m."""
+        """Positions by name, and spread of places left out, for programs; in m."""
         positions = dict(zip(self.names, self.positions.tolist(), strict=True))
-        spread = self.left_out_spread
-        own = {"positions_m": positions, "left_out_spread_m": spread, "expected_error_m": self.workspace_deviation}
-        return {"sockets": own}
+        return {"sockets": {"positions_m": positions, "left_out_spread_m": self.left_out_spread}}
 
     def sentences(self) -> list[str]:
         """Places of the sockets, how well they are predicted, and what that does not show."""
         frame = "the measuring frame" if self.by_device else "the robot's base"
-        among, fitted = ("", "") if self.by_device else ("among the sockets ", ", after a rigid fit")
+        among = "" if self.by_device else "among the sockets "
         lines = [
             f"socket '{name}': {', '.join(f'{1e3 * v:.3f}' for v in place)} mm in {frame}, deviations "
             f"{among}{', '.join(f'{1e3 * v:.3f}' for v in deviation)} mm"
@@ -308,11 +309,7 @@ class SocketDevices(DeviceSet):
             errors = ", ".join(f"{1e3 * error:+.3f}" for error in one.distance_errors)
             known = f", distance {errors} mm" * bool(errors)
             lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
-        lines.append(
-            f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm; expected absolute error "
-            f"over the joint ranges of the rows{fitted}: {1e3 * self.workspace_deviation:.3f} mm"
-        )
-        return lines if self.by_device else [*lines, FLATTERY]
+        return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
 def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float, tuple[float, ...]]:

@@ -39,6 +39,10 @@ from diffeo_calib.robots.tree import Tree
 SMALLEST_STROKE = 1e-9
 
 
+JOINT_DIGITS = 6
+"""Decimal places of joint values in a plan: no controller takes more."""
+
+
 def move_times(q: Tensor, turning: tuple[bool, ...]) -> Tensor:
     """Durations of the moves between configurations: all joints start together and the slowest decides.
 
@@ -190,7 +194,8 @@ class Plan:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
         columns = Columns.of(table.joints_only(), joints or self.joint_names, self.kinds, [])
         devices = [[name] for name in self.devices] or [[]] * len(self)
-        rows = zip(columns.joints_from_si(self.q).tolist(), self.rank.tolist(), devices, strict=True)
+        values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()
+        rows = zip(values, self.rank.tolist(), devices, strict=True)
         header = [*columns.joints, "rank", *["device"] * bool(self.devices)]
         write_rows(path, header, [[[*joints, rank, *device] for joints, rank, device in rows]], table)
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import find_block
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -285,10 +286,10 @@ class Change:
 
     @property
     def _what(self) -> str:
-        sign, within = ("", "") if self.deviation is None else ("+", f" +- {1e3 * self.deviation:.1g}")
-        size = f"{1e3 * self.size:{sign}.2g}{within} mm"
-        if self.angle:
-            size = f"{1e3 * self.size:{sign}.2g}{within} mrad ({degrees(self.size):.2g} degrees)"
+        size = f"{1e3 * self.size:.2g}"
+        if self.deviation is not None:
+            size = with_deviation(1e3 * self.size, 1e3 * self.deviation)
+        size = f"{size} mrad ({degrees(self.size):.2g} degrees)" if self.angle else f"{size} mm"
         by = f", which moves the markers by {1e3 * self.displacement:.2g} mm" if self.angle else ""
         part = " or ".join((self.part, *self.others)) + " (these rows do not tell which)" * bool(self.others)
         return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"

@@ -16,6 +16,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     place_again,
     warn_of_moved_markers,
 )
+from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, changed_offsets, hidden_offsets
 from diffeo_calib.calibration.recalibration.recalibrate import warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
@@ -32,6 +33,8 @@ from diffeo_calib.sensors.errors import Evaluations
 
 GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
+OFFSET_ROWS = 60
+"""Configurations that show which joint offsets differ between two models."""
 MOST_CONFIGURATIONS = 100_000
 MOST_USUAL = 100
 """Rows of the fit that show how certain a model is there."""
@@ -50,6 +53,7 @@ class Comparison:
         expectations: what the model's own uncertainty and noise lead to expect of them. Of each ``rms`` and
             ``expected`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
         usual: what was expected of them where the old model is as certain as at the rows of its fit.
+        hidden: offsets that explain new places of device or markers as well.
     """
 
     moved: Registration | None
@@ -57,6 +61,7 @@ class Comparison:
     errors: Evaluations
     expectations: Evaluations
     usual: Evaluations
+    hidden: tuple[HiddenOffset, ...] = ()
 
     rms = property(lambda self: self.errors.rms)
     expected = property(lambda self: self.expectations.rms)
@@ -68,7 +73,7 @@ class Comparison:
 
     def __str__(self) -> str:
         if self.telling or self.changes.found:
-            return str(self.changes)
+            return "; ".join(map(str, self.hidden)) if self.hidden and not self.changes.found else str(self.changes)
         return (
             "these rows cannot tell whether anything has changed: the old model expects errors of them "
             f"({self.expectations.rms_text}) far above those at the rows of its fit ({self.usual.rms_text}); measure "
@@ -89,6 +94,7 @@ class ModelComparison:
         transmissions: name of each joint -> RMS difference of its transmission errors over its range, rad or m.
         geodesic_length: length of the geodesic of deformations that leads from the first to the second: the root of the
             sum of squares of its parts in units of their prior standard deviations. Zero for equal models.
+        changes: joint offsets that have changed.
         payload: mass that both carry, in the unit of the first model's measurements; None if neither knows payloads.
     """
 
@@ -97,6 +103,7 @@ class ModelComparison:
     deviation: Tensor
     transmissions: dict[str, float]
     geodesic_length: float
+    changes: Changes
     payload: float | None = None
 
     @property
@@ -120,7 +127,7 @@ class ModelComparison:
             f"{words_of_mass(self.payload)}the models differ by {1e3 * self.rms:.3f} mm RMS "
             f"(at most {1e3 * self.largest:.3f} mm), {more} "
             f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
-            f"geodesic length {self.geodesic_length:.2f}"
+            f"geodesic length {self.geodesic_length:.2f}{''.join(f'; {one}' for one in self.changes.found)}"
         )
 
     def __repr__(self) -> str:
@@ -171,7 +178,8 @@ def compare(
     warn_of_scale(rows)
     usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
     usual = usual.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
-    return Comparison(found, changes, *map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual)))
+    errors, expected, usual = map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual))
+    return Comparison(found, changes, errors, expected, usual, hidden_offsets(model.robot, before, changes))
 
 
 def _usual_deviation(model: CalibratedKinematics) -> float:
@@ -201,7 +209,10 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
     deviation = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + variances).sqrt()
     transmissions = {name: _transmission(first, second, name, q) for name in first.robot.joint_names}
     length = _geodesic_length(first, q[:GEODESIC_ROWS], other_mean[:GEODESIC_ROWS])
-    return ModelComparison(q, other_mean.unflatten(1, (-1, 3)) - mean, deviation, transmissions, length, payload)
+    difference = other_mean.unflatten(1, (-1, 3)) - mean
+    some = slice(OFFSET_ROWS)
+    changes = changed_offsets(first.robot, first.map, placed, q[some], difference[some].flatten(1))
+    return ModelComparison(q, difference, deviation, transmissions, length, changes, payload)
 
 
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:

@@ -36,6 +36,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     size_ratio,
     warn_of_moved_markers,
 )
+from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
@@ -76,6 +77,7 @@ class Recalibration:
         after: the same from the new model.
         left_out: the same, each new row predicted by the old ones and the other new ones. Of each ``rms_before``,
             ``rms_after`` and ``left_out_rms`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
+        hidden: offsets that explain new places of device or markers as well, where no change is named.
         inflation: factor on all variances of the old scales with which regions hold the new rows, at least one.
         fit: the exact model's fit with its certificates.
     """
@@ -92,6 +94,7 @@ class Recalibration:
     left_out: Evaluations
     inflation: float
     fit: Fit
+    hidden: tuple[HiddenOffset, ...] = ()
 
     rms_before = property(lambda self: self.before.rms)
     rms_after = property(lambda self: self.after.rms)
@@ -216,6 +219,7 @@ def _result(
         left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
+        hidden=hidden_offsets(model.robot, place, changes),
     )
 
 

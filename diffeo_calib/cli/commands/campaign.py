@@ -145,4 +145,7 @@ def _end(live: Live, inbox: Inbox, listener: Listener | None) -> None:
             sent.answer(state | {"error": "the campaign has ended; the row was not taken in"})
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
-    live.say(accepted + expected(live.campaign), state)
+    later = live.ignored + len(live.new_lines())
+    rest = f"; the target is reached: {later} later lines of the table were not judged" * (later > 0)
+    unread = f", {len(live.unreadable)} lines could not be read" * bool(live.unreadable)
+    live.say(accepted + unread + expected(live.campaign) + rest, state)

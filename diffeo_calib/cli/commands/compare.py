@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
-from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry
+from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry, offsets_entry
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.printed import motion_lines
@@ -39,13 +39,16 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         return
     record.add(
         changes=changes_entry(found.changes),
+        possible_offsets=offsets_entry(found.hidden),
         rows_can_tell=found.telling,
         **({} if found.moved is None else {"transform": found.moved.transform}),
         **entries_by_kind(
             {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
         ),
     )
-    for line in () if found.moved is None else motion_lines(found.moved, model.on):
+    for line in (
+        () if found.moved is None else motion_lines(found.moved, model.on, robot_changed=bool(found.changes.found))
+    ):
         say(line)
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
@@ -70,6 +73,7 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         expected_m=found.expected,
         largest_m=found.largest,
         geodesic_length=found.geodesic_length,
+        changes=changes_entry(found.changes),
         transmissions_rad_or_m=found.transmissions,
         files={} if figure is None else {"figure": figure},
     )

@@ -14,7 +14,7 @@ from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
-from diffeo_calib.calibration.result import KindErrors, errors_by_kind
+from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command
 from diffeo_calib.cli.printed import (
@@ -33,13 +33,11 @@ from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
-from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
@@ -111,7 +109,7 @@ def run(
         say(line)
     for one in (held_out or {}).values():
         if one.one.what == ERRORS:
-            _show_verdict(one.stages["geometry"], one.stages["diffeomorphic"], wrong=bool(wrong))
+            _show_verdict(one.stages[GEOMETRIC], one.stages[CALIBRATED], wrong=bool(wrong))
     say(f"model: {outputs.model}")
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
@@ -122,7 +120,7 @@ def _verdict(result: CalibrationResult, held_out: Errors) -> Iterator[str]:
     """How accurate the robot is now, first of all: by measured positions, or by what the model expects."""
     judged = [one.stages for one in held_out.values() if one.one.what == ERRORS]
     for stage in judged:
-        geometry, model = stage["geometry"], stage["diffeomorphic"]
+        geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
         unit, per_unit = model.shown
         rms, most, before = (f"{per_unit * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
         yield f"held out: {rms} {unit} RMS, 95 % below {most} ({model.count} rows; geometry alone {before} {unit} RMS)"
@@ -136,7 +134,7 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
         raise typer.Exit(EXIT_INTERRUPTED)
     for kind, one in judged.items():
         if one.one.what == ERRORS and kind in in_train:
-            check_errors(result.model, one.one, in_train[kind].stages["geometry"].median)
+            check_errors(result.model, one.one, in_train[kind].stages[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
@@ -194,8 +192,9 @@ def _write_pictures(
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
         with progress_bar() as progress:
-            own, placed = _report_stages(result)
-            write_report(result.model, outputs.report, data, stages=own, places=placed, progress=progress)
+            placed = {stage: result.places(stage) for stage in result.stages}
+            how = {"stages": result.stages, "places": placed, "warnings": record.warnings}
+            write_report(result.model, outputs.report, data, **how, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
 
@@ -224,13 +223,6 @@ def _record(
         status=result.status,
         files={name: path for name, path in files.items() if path is not None},
     )
-
-
-def _report_stages(result: CalibrationResult) -> tuple[dict[str, Kinematics], dict[str, Places]]:
-    """The stages of a calibration under the names of reports, and the places of their devices."""
-    names = NOMINAL, GEOMETRIC, CALIBRATED
-    places = [result.places(stage) for stage in result.stages]
-    return dict(zip(names, result.stages.values(), strict=True)), dict(zip(names, places, strict=True))
 
 
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:

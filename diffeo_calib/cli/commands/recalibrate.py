@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import typer
 
 from diffeo_calib.calibration.recalibration.changes import Changes
+from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
@@ -46,6 +48,7 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
         changes=changes_entry(result.changes),
+        possible_offsets=offsets_entry(result.hidden),
         markers=result.marker,
         **({} if result.moved is None else {"transform": result.moved.transform}),
         converged=result.fit.converged,
@@ -60,7 +63,7 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     )
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     frame = () if result.moved is None else frame_lines(result.moved)
-    for line in (*frame, *_found(result), *places, *change_lines(result.changes)):
+    for line in (*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden)):
         say(line)
     say(result.fit.status)
     say(f"model: {output}")
@@ -72,9 +75,11 @@ def _found(result: Recalibration) -> list[str]:
     """Errors of the new rows, and those that hardly count."""
     shift = None if result.moved is None else result.moved.shift
     moved = "have moved" if shift is None else f"have moved by {1e3 * float(shift.norm(dim=1).max()):.2g} mm"
+    moved += ", or the change below is in this" * bool(result.changes.found)
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
+    placed = [] if any("markers" in one.instead for one in result.hidden) else [f"the markers {markers[result.marker]}"]
     lines = [
-        f"the markers {markers[result.marker]}",
+        *placed,
         f"new rows, RMS from the old model, device and markers found anew: {result.before.rms_text}",
         f"new rows, RMS if each is predicted by the old rows and the other new ones: {result.left_out.rms_text}",
     ]
@@ -91,6 +96,11 @@ def changes_entry(changes: Changes) -> list[dict[str, object]]:
         {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
         for one in changes.found
     ]
+
+
+def offsets_entry(hidden: Sequence[HiddenOffset]) -> list[dict[str, object]]:
+    """Offsets that explain new places of device or markers as well, for programs."""
+    return [{"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden]
 
 
 def change_lines(changes: Changes) -> list[str]:

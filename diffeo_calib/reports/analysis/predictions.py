@@ -85,9 +85,15 @@ class Predictions:
         limits = SHARES.new_tensor([chi2_above(1.0 - share, 3) for share in SHARES.tolist()])
         return (known(self.squares)[:, None] <= limits).double().mean(0)
 
+    def inside(self, share: float = 0.95) -> tuple[int, int]:
+        """Number of errors inside the regions that claim ``share``, and of all."""
+        squares = known(self.squares)
+        return int((squares <= chi2_above(1.0 - share, 3)).sum()), len(squares)
+
     def coverage(self, share: float = 0.95) -> float:
-        """Share of errors inside the regions that claim ``share``."""
-        return float((known(self.squares) <= chi2_above(1.0 - share, 3)).double().mean())
+        """Share of errors inside these regions."""
+        inside, count = self.inside(share)
+        return inside / count
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""

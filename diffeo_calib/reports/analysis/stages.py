@@ -13,6 +13,7 @@ from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -21,7 +22,6 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.sensors.errors import Evaluation
 
-NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 Kinematics = Callable[[Tensor], Tensor]
 
 

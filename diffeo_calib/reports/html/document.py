@@ -105,6 +105,7 @@ class Page:
 
     Args:
         title: of the page. subtitle: where the numbers come from. verdict: the result in one line.
+        warnings: what the fit warned of.
         advice: what to do next. figures: name -> value, the numbers at the top.
         sections: in the order of the page.
     """
@@ -114,6 +115,7 @@ class Page:
     verdict: str
     advice: Sequence[str]
     figures: Mapping[str, str]
+    warnings: Sequence[str] = ()
     sections: Sequence[Section] = field(default_factory=tuple)
 
     def html(self) -> str:

@@ -235,8 +235,7 @@ MOST_REPEATS = 12
 
 def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
-    share = 100 * found.predictions.coverage()
-    see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {sentences.judged(found)}"
+    see = sentences.judged(found)
     tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
     tables.append(_largest(found))
     notes = list(found.moved)

@@ -8,7 +8,7 @@ import torch
 
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
-from diffeo_calib.common.quantiles import largest_known
+from diffeo_calib.common.quantiles import binomial_band, largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
@@ -25,6 +25,10 @@ ENOUGH_FOR_P95 = 20
 """Rows from which a 95th percentile means something."""
 BAD_RATIO = 1.5
 """Ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named."""
+
+
+CHANCE = 0.05
+"""Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""
 
 
 def rows_of(found: Findings) -> str:
@@ -56,7 +60,8 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
     if len(found.predictions) >= ENOUGH_FOR_P95:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
-    yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
+    inside, count = found.predictions.inside()
+    yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
     error = found.expected.error
     if error.whole > FAR_RATIO * error.measured:
         apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
@@ -164,11 +169,17 @@ def worst_range(found: Findings) -> Iterator[str]:
 
 
 def judged(found: Findings) -> str:
-    """Whether the claimed regions can be believed."""
-    share, rows = 100 * found.predictions.coverage(), len(found.predictions)
-    spread = 2 * (95 * 5 / max(rows, 1)) ** 0.5
-    if share < 95 - 2 * spread:
-        return "The model is overconfident on these rows: widen its deviations, or measure more poses like them."
-    if share > 95 + spread:
-        return "Its deviations are cautious on these rows."
-    return "Its deviations, which contain the noise of a measurement, can be believed for poses like these."
+    """Whether the claimed regions can be believed, as far as the number of rows tells."""
+    inside, count = found.predictions.inside()
+    low, high = binomial_band(count, 0.95, CHANCE)
+    if inside < low:
+        what = "these are too small: widen the model's deviations, or measure more poses like these"
+    elif inside > high:
+        what = "these are cautious"
+    else:
+        what = "these, which contain the noise of a measurement, agree with that for poses like the ones shown"
+    hold = f"{low} to {high}" if low < high else f"all {high}"
+    return (
+        f"{inside} of {count} errors lie in the regions that claim 95 %. Of {count} errors, regions of the right size "
+        f"hold {hold} in nine cases of ten; {what}."
+    )

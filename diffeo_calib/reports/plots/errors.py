@@ -9,12 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import Predictions
-from diffeo_calib.reports.analysis.stages import GEOMETRIC, stages_of
+from diffeo_calib.reports.analysis.stages import stages_of
 from diffeo_calib.reports.plots.style import BLUE, FAINT, GREY, INK, LOOKS, finish, legend, literal, note, panels
 from diffeo_calib.sensors.errors import Evaluation
 
@@ -116,7 +117,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
     figure = Figure(figsize=(9.6, 4.8), layout="constrained")
     size = float((places.amax(0) - places.amin(0)).max())
     factor = ARROW_SHARE * size / max(float(before.norm(dim=-1).max()), float(after.norm(dim=-1).max()), 1e-12)
-    for number, (errors, name) in enumerate(((before, "geometric"), (after, "calibrated")), 1):
+    for number, (errors, name) in enumerate(((before, GEOMETRIC), (after, CALIBRATED)), 1):
         axes: Any = figure.add_subplot(1, 2, number, projection="3d")
         _arrows(axes, places, errors, factor)
         rms = 1e3 * float(errors.square().sum(-1).mean().sqrt())

@@ -74,7 +74,7 @@ def test_as_accurate_as_expected(name: str) -> None:
     kinds = errors_by_kind(result, dc.Observations.joined(parts))
     assert len(kinds) == len(parts)
     for one in kinds.values():
-        assert one.stages["diffeomorphic"].rms < one.stages["geometry"].rms
+        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,141 @@
+"""Joint offsets between two calibrations, and those that a moved device or marker would hide.
+
+Two models differ by d over the workspace, with covariance K. With J_k the derivative of the points by an offset, its
+most probable change and deviation are
+
+    s = J_k^T K^-1 d / h,    sd = 1 / sqrt(h),    h = J_k^T K^-1 J_k,
+
+K with the places of device and markers unknown. An offset whose J_k these places reproduce is not named: they hide it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.recalibration.changes import LEVEL, TOLD_APART, Change, Changes
+from diffeo_calib.calibration.recalibration.new_set_up import Before, robot_map
+from diffeo_calib.common.errors import with_deviation
+from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.tree import Tree
+
+FLOOR_M = 5e-6
+"""Deviation of each coordinate of a difference of models, beside what both expect."""
+HIDDEN_SHARE = 0.3
+"""Displacement by an offset that places do not reproduce, relative to the noise, up to which rows do not show it."""
+SMALLEST_CHANCE = 1e-6
+"""That is stated: the models' covariances are no better known."""
+PRISMATIC = "prismatic"
+
+
+class HiddenOffset(NamedTuple):
+    """An offset that explains a new place as well.
+
+    Args:
+        joint: its name. size, deviation: of the offset, rad or m. angle: whether it is in rad.
+        instead: what has moved otherwise, in words.
+    """
+
+    joint: str
+    size: float
+    deviation: float
+    angle: bool
+    instead: str
+
+    def __str__(self) -> str:
+        unit = "mrad" if self.angle else "mm"
+        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
+        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
+
+
+def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[HiddenOffset, ...]:
+    """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
+
+    Args:
+        robot: with n joints. before: the old map and the new rows. changes: of the robot, as these show them.
+    """
+    found = before.registration
+    if found is None or changes.found:
+        return ()
+    old = before.fitted
+    S, J = _slopes(RegisteredMap(moved(old, robot_map(old), found.transform), found), found.q)
+    noise = float(found.noise.diagonal().mean().sqrt())
+    places = {"the measuring device has moved": (slice(0, 6), _motion(found))}
+    if found.shift is not None:
+        places["the markers have moved"] = (slice(6, None), found.shift.flatten())
+    hidden = []
+    for instead, (own, place) in places.items():
+        K, free = found.covariance[own, own], found.covariance.diagonal()[own] > 0
+        if not bool(free.all()):
+            continue
+        total = float(place @ torch.linalg.solve(K, place))
+        if total < chi2_above(LEVEL, len(place)):
+            continue
+        for joint, name in enumerate(robot.joint_names):
+            d = torch.linalg.lstsq(S[:, own], J[:, joint, None]).solution[:, 0]
+            W = torch.linalg.solve(K, d)
+            size, deviation = float(W @ place / (W @ d)), float(W @ d) ** -0.5
+            unseen = abs(size) * float((J[:, joint] - S[:, own] @ d).square().mean().sqrt())
+            left = total - (size / deviation) ** 2
+            if unseen < HIDDEN_SHARE * noise and left < chi2_above(LEVEL, len(place) - 1):
+                hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != PRISMATIC, instead))
+    return tuple(hidden)
+
+
+def _motion(found: Registration) -> Tensor:
+    """(6,) shift at the centre and small turn of the measuring frame."""
+    T, centre = found.transform, found.centre
+    before = T[:3, :3].mT @ (centre - T[:3, 3])
+    return torch.cat([centre - before, rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]])
+
+
+def _slopes(placed: RegisteredMap, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of the points at q by places (M m, 6 + 3 P) and by joint offsets (M m, n)."""
+    return placed.place_slopes(q), placed.geodesic.linearise(q).joint_to_start.flatten(0, 1)
+
+
+def changed_offsets(robot: Tree, first: FittedMap, placed: RegisteredMap, q: Tensor, difference: Tensor) -> Changes:
+    """Offsets that have changed from one model to another.
+
+    Args:
+        robot: with n joints. first: a map. placed: the other one in its place. q: (M, n) some configurations.
+        difference: (M, 3 P) of the points there, other minus first, m.
+    """
+    S, J = _slopes(placed, q)
+    K = first.joint_covariance(q) + FittedMap.joint_covariance(placed, q) + PLACES.session_m_rad**2 * S @ S.mT
+    K = K + FLOOR_M**2 * torch.eye(len(K), dtype=K.dtype, device=K.device)
+    d, changes, first_seen, shown = difference.flatten(), [], {}, J - S @ torch.linalg.lstsq(S, J).solution
+    left = list(range(robot.n))
+    while left:
+        factor = torch.linalg.cholesky(K)
+        white, columns = (torch.linalg.solve_triangular(factor, each, upper=False) for each in (d[:, None], J[:, left]))
+        h, g = columns.square().sum(0), (columns * white).sum(0)
+        excess = ((white.square().sum() - g**2 / h) / len(d)).clamp(min=1.0)
+        ratios = g**2 / h / excess
+        chances = [chi2_probability(float(ratio), 1) * robot.n for ratio in ratios]
+        first_seen = first_seen or dict(zip((robot.joint_names[k] for k in left), chances, strict=True))
+        best = int(ratios.argmax())
+        if chances[best] > LEVEL:
+            break
+        joint, size = left[best], float(g[best] / h[best])
+        near = [k for n, k in enumerate(left) if n != best and float(ratios[n]) > float(ratios[best]) - TOLD_APART]
+        changes.append(
+            Change(
+                f"the offset of {robot.joint_names[joint]}",
+                size,
+                robot.kinds[joint] != PRISMATIC,
+                abs(size) * float(shown[:, joint].square().mean().sqrt()) * 3**0.5,
+                max(chances[best], SMALLEST_CHANCE),
+                float((excess[best] / h[best]).sqrt()),
+                tuple(f"the offset of {robot.joint_names[k]}" for k in near),
+            )
+        )
+        left.remove(joint)
+        K = K + size**2 * J[:, joint, None] @ J[:, joint, None].mT
+    return Changes(tuple(changes), first_seen, 1.0, len(q), LEVEL)

@@ -1,0 +1,92 @@
+"""Tables under the names that README and site use, and the outputs that tutorials show."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import get_ur10_data
+from product_bank import simulated, simulated_poses
+from trackerless_bank import write_socket_table, write_wire_table
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+OFFSET = 5e-4
+"""Of the second joint since the first calibration, rad."""
+COMMAND = re.compile(r"^    (diffeo-calib (?:.*\\\n)*.*)\n(?:\n```text\n((?:(?!```).*\n)*)```\n)?", re.MULTILINE)
+"""A command of a page, and the output below it."""
+CUT = "..."
+
+
+def write_tables(place: Path) -> None:
+    """A simulated arm, and tables of its measurements."""
+    arm, train, test = simulated(100)
+    arm.write_urdf(place / "robot.urdf")
+    names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
+    later = test.q.clone()
+    later[:, 1] -= OFFSET
+    changed = dc.Measurements(later, test.points)
+    for name, data in (
+        ("measurements", train),
+        ("other", test[:60]),
+        ("joints", test[:60]),
+        ("program", test[:40]),
+        ("new", changed[:20]),
+        ("check", changed[20:40]),
+    ):
+        write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
+    write_socket_table(place / "block.csv", arm, "01", 0, places=6, rows=20)
+    write_wire_table(place / "wire.csv", arm, 0)
+    posed = simulated_poses(30)[1]
+    rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
+    write_measurements(place / "poses.csv", posed, rotation)
+    source = os.environ.get("DIFFEO_CALIB_DATA")
+    if source:
+        get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
+
+
+def commands(text: str) -> list[str]:
+    """The commands of a page, a line each."""
+    return [one_line(found[1]) for found in COMMAND.finditer(text)]
+
+
+def one_line(command: str) -> str:
+    return " ".join(command.replace("\\\n", " ").split())
+
+
+def shown_outputs(text: str) -> dict[str, list[str]]:
+    """The outputs of a page's commands that it shows, line by line, without the marks of what was cut."""
+    found = {one_line(one[1]): one[2] for one in COMMAND.finditer(text) if one[2]}
+    return {command: [line for line in output.splitlines() if line != CUT] for command, output in found.items()}
+
+
+def with_outputs(text: str, output_of: Callable[[str], list[str]]) -> str:
+    """The page with the outputs of its commands anew."""
+
+    def block(found: re.Match[str]) -> str:
+        lines = output_of(one_line(found[1]))
+        return f"    {found[1]}\n\n```text\n" + "".join(f"{line}\n" for line in shortened(lines)) + "```\n"
+
+    return COMMAND.sub(block, text)
+
+
+MOST_LINES, LAST = 18, 4
+
+
+def shortened(lines: list[str]) -> Iterator[str]:
+    """At most so many of the lines that are not empty, and a mark where some are missing."""
+    lines = [line.rstrip() for line in lines if line.strip()]
+    if len(lines) <= MOST_LINES:
+        yield from lines
+        return
+    yield from [*lines[: MOST_LINES - LAST], CUT, *lines[-LAST:]]
+
+
+def words(line: str) -> tuple[str, ...]:
+    """The first words of a line, numbers left out: what does not depend on the processor."""
+    return tuple(re.sub(r"[-+]?\d[\d.e+-]*", "#", line).split()[:3])
