@@ -29,6 +29,8 @@ FLOOR_M = 5e-6
 """Deviation of each coordinate of a difference of models, beside what both expect."""
 HIDDEN_SHARE = 0.3
 """Displacement by an offset that places do not reproduce, relative to the noise, up to which rows do not show it."""
+RANK_TOLERANCE = 1e-9
+"""Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
 SMALLEST_CHANCE = 1e-6
 """That is stated: the models' covariances are no better known."""
 PRISMATIC = "prismatic"
@@ -74,18 +76,31 @@ def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[Hidde
         K, free = found.covariance[own, own], found.covariance.diagonal()[own] > 0
         if not bool(free.all()):
             continue
-        total = float(place @ torch.linalg.solve(K, place))
-        if total < chi2_above(LEVEL, len(place)):
+        P, count = _precision(K)
+        total = float(place @ P @ place)
+        if total < chi2_above(LEVEL, count):
             continue
         for joint, name in enumerate(robot.joint_names):
             d = torch.linalg.lstsq(S[:, own], J[:, joint, None]).solution[:, 0]
-            W = torch.linalg.solve(K, d)
-            size, deviation = float(W @ place / (W @ d)), float(W @ d) ** -0.5
+            W = P @ d
+            known = float(W @ d)
+            if known <= 0.0:  # It moves the places only as they are known not to move.
+                continue
+            size, deviation = float(W @ place) / known, known**-0.5
             unseen = abs(size) * float((J[:, joint] - S[:, own] @ d).square().mean().sqrt())
             left = total - (size / deviation) ** 2
-            if unseen < HIDDEN_SHARE * noise and left < chi2_above(LEVEL, len(place) - 1):
+            if unseen < HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
                 hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != PRISMATIC, instead))
     return tuple(hidden)
+
+
+def _precision(K: Tensor) -> tuple[Tensor, int]:
+    """Pseudo-inverse of a covariance, (k, k), and its rank: markers of one body that moved together leave it singular."""
+    scale = K.diagonal().sqrt()
+    values, Q = torch.linalg.eigh(K / scale / scale[:, None])
+    kept = values > RANK_TOLERANCE * values[-1]
+    Q = Q[:, kept] / scale[:, None]
+    return Q / values[kept] @ Q.mT, int(kept.sum())
 
 
 def _motion(found: Registration) -> Tensor:
