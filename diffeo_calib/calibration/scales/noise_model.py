@@ -51,7 +51,7 @@ FINEST_SHARE = 0.3
 def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
     """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
 
-    A slack of that size would drown what images of a board tell across the line of sight, a tenth of the error along it.
+    A slack of that size would drown what images of a board tell across the line of sight: a tenth of that along it.
     """
     size = 0 if known is None else known.shape[1] // bodies
     if known is None or size < FREEDOM_OF_POSES:
