@@ -101,13 +101,18 @@ def calibrated(robot: dc.Tree, data: dc.Measurements) -> tuple[dc.CalibrationRes
     return result, {**others, "geometry": result.identification.geometry.points, "full": result.model}
 
 
-def real(name: str, folder: Path) -> Iterator[Record]:
-    """Every place of a robot left out."""
+def read(name: str, folder: Path) -> tuple[dc.Tree, dc.Measurements]:
+    """A robot and its rows."""
     urdf, base = ROBOTS[name]
     robot = dc.load_urdf(folder / urdf, base, "ball_link")
     known = {"distances": DISTANCES, "distance_std": DISTANCE_STD}
     rows = {"length": "m", "angle": "rad", "duplicates": "keep"}
-    data = dc.read_measurements(folder / f"{name}.csv", robot, socket=["place", "socket"], **rows, **known)
+    return robot, dc.read_measurements(folder / f"{name}.csv", robot, socket=["place", "socket"], **rows, **known)
+
+
+def real(name: str, folder: Path) -> Iterator[Record]:
+    """Every place of a robot left out."""
+    robot, data = read(name, folder)
     assert data.socket is not None
     assert data.sockets is not None
     place, totals = data.sockets.place[data.socket], dict[str, list[tuple[int, float, float]]]()
