@@ -8,8 +8,9 @@ that see the same board, half of the images each, and of a head that sees a boar
 drawn from its prior, its scale is known to 2e-4. Fields: `case`, `seed`, `images`, `noise_px`, `method`; `true_mm`,
 RMS error of three points of the camera's pose (0.1 m) over 200 new configurations in which it sees the board, without
 noise, after a rigid fit; `coverage_95` of these points by the model's regions without rigid motions,
-`coverage_absolute` with them and without the fit; `expected_mm`, what the model expects of `true_mm`; `seconds`;
-`memory_mib`, the process's peak so far.
+`coverage_absolute` with them and without the fit; `expected_mm`, what the model expects of `true_mm`; the same three
+`apart_*` from the board's size, one number that all images share: by the print `true_mm` is then right or wrong as a
+whole; `size_z`, its error in standard deviations; `seconds`; `memory_mib`, the process's peak so far.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ from diffeo_calib.robots.se3 import skew
 
 COUNTS, NOISES_PX, TEST_ROWS = (30, 60, 120), (0.1, 0.3), 200
 COLUMNS = ("case", "seed", "images", "noise_px", "method", "true_mm", "expected_mm", "coverage_95", "coverage_absolute")
-COLUMNS = (*COLUMNS, "seconds", "memory_mib")
+COLUMNS = (*COLUMNS, "apart_true_mm", "apart_expected_mm", "apart_coverage_95", "size_z", "seconds", "memory_mib")
 
 
 class Rows(NamedTuple):
@@ -170,23 +171,46 @@ def _pixels(robot: dc.Tree, images: Callable[[], dc.Measurements], new: Tensor, 
 def _regions(model: dc.CalibratedKinematics, new: Tensor, truth: Tensor) -> Record:
     """True and expected error, and shares of true points (N, 3, 3) within the model's 95 % regions."""
     mean, fitted = model(new).detach(), model.map
-    R, t = rigid_fit(truth.flatten(0, 1), mean.flatten(0, 1))
+    points = mean.flatten(0, 1)
+    R, t = rigid_fit(truth.flatten(0, 1), points)
+    error = truth.flatten(0, 1) @ R + t - points
     whole = fitted.covariance_between(fitted.geodesic.linearise(new))
-    free = without_rigid_motions(whole, mean.flatten(0, 1))
-    own, blocks = (own_blocks(one[None], mean[..., 0].numel())[0].view(*mean.shape, 3) for one in (whole, free))
+    motions = rigid_motions(points)
+    larger = mean.mean(1, keepdim=True).expand_as(mean).reshape(-1, 1)  # a larger board is farther away as a whole
+    free, apart = (without(directions, whole) for directions in (motions, torch.cat([motions, larger], 1)))
+    size = torch.linalg.qr(torch.cat([motions, larger], 1)).Q[:, -1]
+    left = (error.flatten() - size * (size @ error.flatten())).view_as(error)
+    absolute = truth.flatten(0, 1) - points
     return {
-        "true_mm": round(1e3 * rigid_rms(mean, truth), 4),
-        "expected_mm": round(1e3 * float(blocks.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()), 4),
-        "coverage_95": round(covered(truth @ R + t - mean, blocks), 3),
-        "coverage_absolute": round(covered(truth - mean, own), 3),
+        "true_mm": _mm(error.square().sum(1)),
+        "expected_mm": _mm(_blocks(free).diagonal(dim1=1, dim2=2).sum(1)),
+        "coverage_95": round(covered(error, _blocks(free)), 3),
+        "coverage_absolute": round(covered(absolute, _blocks(whole)), 3),
+        "apart_true_mm": _mm(left.square().sum(1)),
+        "apart_expected_mm": _mm(_blocks(apart).diagonal(dim1=1, dim2=2).sum(1)),
+        "apart_coverage_95": round(covered(left, _blocks(apart)), 3),
+        "size_z": round(float(size @ error.flatten() / (size @ free @ size).sqrt()), 2),
     }
 
 
-def without_rigid_motions(covariance: Tensor, points: Tensor) -> Tensor:
-    """The covariance (3 M, 3 M) of points (M, 3) after their best rigid motion."""
+def _mm(squares: Tensor) -> float:
+    return round(1e3 * float(squares.mean().sqrt()), 4)
+
+
+def _blocks(covariance: Tensor) -> Tensor:
+    """Of every point: (3 M, 3 M) -> (M, 3, 3)."""
+    return own_blocks(covariance[None], len(covariance) // 3)[0]
+
+
+def rigid_motions(points: Tensor) -> Tensor:
+    """Displacements (3 M, 6) of points (M, 3) by shifts and turns."""
     eye = torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3)
-    motions = torch.cat([eye, -skew(points - points.mean(0))], 2).flatten(0, 1)
-    Q = torch.linalg.qr(motions).Q
+    return torch.cat([eye, -skew(points - points.mean(0))], 2).flatten(0, 1)
+
+
+def without(directions: Tensor, covariance: Tensor) -> Tensor:
+    """The covariance (3 M, 3 M) of what is left after the best combination of directions (3 M, k)."""
+    Q = torch.linalg.qr(directions).Q
     less = covariance - Q @ (Q.mT @ covariance)
     return less - (less @ Q) @ Q.mT
 

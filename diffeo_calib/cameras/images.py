@@ -22,7 +22,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, board_slopes, project, project_slopes, real_board
+from diffeo_calib.cameras.board import (
+    BOARD,
+    LENS,
+    BoardPrior,
+    View,
+    board_slopes,
+    project,
+    project_slopes,
+    real_board,
+)
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
@@ -37,6 +46,8 @@ PRIOR_IMAGE_CORNERS = 10.0
 """Corners of a usual image whose noise counts beside an image's own."""
 CENTRE_SHARE, FOCAL_SHARE = 0.25, 1.0
 """Prior deviations of the principal point relative to the image's width, and of focal lengths."""
+BOARD_DIGITS = 7
+"""Decimal places, m, of corners of a board that are the same."""
 DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)
 """Prior standard deviations of k1, k2, p1, p2, k3."""
 
@@ -76,6 +87,7 @@ class Camera:
         width, height: of the images, pixels. half_size: of the board, m.
         unknowns: (14,) lens and board, see UNKNOWNS. root: (14, c) with root root^T their covariance.
         noise: standard deviation of a corner's coordinate, pixels.
+        view: what its images showed; None before images.
     """
 
     width: int
@@ -84,6 +96,7 @@ class Camera:
     unknowns: Tensor
     root: Tensor
     noise: float = 0.0
+    view: View | None = None
 
     @property
     def lens(self) -> Tensor:
@@ -180,7 +193,7 @@ def sighted_by_several(
         _check(one)
     known = _known(images, cameras, board or BoardPrior())
     v = torch.zeros_like(known[0].root[0])
-    states = [_State(*own, first_poses(*own), v) for own in zip(images, known, strict=True)]
+    states = [State(*own, first_poses(*own), v) for own in zip(images, known, strict=True)]
     weights = [_weights(state, state.errors().norm(dim=-1).nanmedian() / 1.2) for state in states]
     for _ in range(ROUNDS):
         states = _minimum(states, weights)
@@ -289,7 +302,7 @@ def undistorted(pixels: Tensor, lens: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class State:
     """Poses (N, 4, 4) of the board, and v (c,), with lens and board = known.unknowns + known.root v."""
 
     images: Images
@@ -299,6 +312,7 @@ class _State:
 
     @property
     def camera(self) -> Camera:
+        """With this lens and board."""
         return replace(self.known, unknowns=self.known.unknowns + self.known.root @ self.v)
 
     def errors(self) -> Tensor:
@@ -314,7 +328,7 @@ class _State:
         by_board = by_point @ self.poses[:, None, :3, :3] @ board_slopes(points, camera.half_size)
         return by_pose, torch.cat([by_lens, by_board], -1) @ self.known.root
 
-    def moved(self, steps: Tensor, v: Tensor) -> _State:
+    def moved(self, steps: Tensor, v: Tensor) -> State:
         """After shifts and turns (N, 6), and with other unknowns."""
         R = rotation(steps[:, 3:]) @ self.poses[:, :3, :3]
         return replace(self, poses=transforms(R, self.poses[:, :3, 3] + steps[:, :3]), v=v)
@@ -334,18 +348,23 @@ class _Normal(NamedTuple):
     along: Tensor
 
     @classmethod
-    def of(cls, state: _State, weights: Tensor, damping: float = 0.0) -> _Normal:
+    def of(cls, state: State, weights: Tensor, damping: float = 0.0) -> _Normal:
         """The normal equations of one camera's images."""
         by_pose, by_v = ((own * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for own in state.slopes())
         errors = (state.errors() * weights[..., None]).nan_to_num(0.0).flatten(1)[..., None]
         A, B = by_pose.mT @ by_pose, by_pose.mT @ by_v
         A = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
-        size = A.diagonal(dim1=1, dim2=2).rsqrt()
-        inverse = size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
+        inverse = inverses(A)
         push, effect = by_pose.mT @ errors, inverse @ B
         known = (by_v.mT @ by_v - B.mT @ effect).sum(0)
         along = (by_v.mT @ errors - effect.mT @ push).sum(0)[:, 0]
         return cls(inverse, effect, known, push[..., 0], along)
+
+
+def inverses(A: Tensor) -> Tensor:
+    """Of matrices (N, 6, 6) whose rows have different units."""
+    size = A.diagonal(dim1=1, dim2=2).rsqrt()
+    return size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
 
 
 def _together(parts: Sequence[_Normal]) -> Tensor:
@@ -353,13 +372,13 @@ def _together(parts: Sequence[_Normal]) -> Tensor:
     return _eye(len(parts[0].along), parts[0].known) + sum(own.known for own in parts)
 
 
-def _cost(states: Sequence[_State], weights: Sequence[Tensor]) -> float:
+def _cost(states: Sequence[State], weights: Sequence[Tensor]) -> float:
     """Weighted squares of all errors, and of v."""
     own = sum(state.cost(each) for state, each in zip(states, weights, strict=True))
     return own + float(states[0].v.square().sum())
 
 
-def _minimum(states: Sequence[_State], weights: Sequence[Tensor]) -> list[_State]:
+def _minimum(states: Sequence[State], weights: Sequence[Tensor]) -> list[State]:
     """Levenberg and Marquardt's method with the poses eliminated."""
     damping, cost, states = 1e-6, _cost(states, weights), list(states)
     for _ in range(STEPS):
@@ -381,7 +400,7 @@ def _minimum(states: Sequence[_State], weights: Sequence[Tensor]) -> list[_State
     return states
 
 
-def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
+def _weights(state: State, noise: Tensor | None = None) -> Tensor:
     """Square roots of the corners' weights (N, K), 1 / pixel, zero where not seen: outliers of an image count less."""
     seen, size = state.images.seen, state.errors().norm(dim=-1).nan_to_num(0.0)
     if noise is None:
@@ -395,17 +414,24 @@ def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
     return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
 
 
-def _result(states: Sequence[_State], weights: Sequence[Tensor]) -> list[Sights]:
+def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
     parts = [_Normal.of(state, own) for state, own in zip(states, weights, strict=True)]
     root = torch.linalg.inv(torch.linalg.cholesky(_together(parts))).mT  # root root^T = K^-1
-    found = []
+    points, found = _board(states), []
     for state, own, part in zip(states, weights, parts, strict=True):
         squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
         noise = float((2 * seen.sum() / own.square().sum() / 2).sqrt())
-        camera = replace(state.camera, root=state.known.root @ root, noise=noise)
+        view = View.of(state.images.seen, state.poses, points)
+        camera = replace(state.camera, root=state.known.root @ root, noise=noise, view=view)
         rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
         found.append(Sights(camera, state.poses, part.inverse, part.effect @ root, rms))
     return found
+
+
+def _board(states: Sequence[State]) -> Tensor:
+    """(K, 3) all corners that images showed, m."""
+    every = torch.cat([state.images.points[state.images.seen] for state in states])
+    return every.round(decimals=BOARD_DIGITS).unique(dim=0)
 
 
 def _check(images: Images) -> None:

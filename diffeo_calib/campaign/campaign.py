@@ -50,7 +50,8 @@ class Campaign:
 
     Args:
         robot: nominal chain, n joints.
-        candidates: (M, n) configurations that can be measured, rad or m; drawn within the joint limits by default.
+        candidates: (M, n) configurations that can be measured, rad or m; drawn within the joint limits by default, and
+            where a camera sees its board near the rows so far. Those at which it does not are never proposed.
         target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
         goal: RMS error over the target to reach, m, see :attr:`reached`.
         background: whether models are renewed in a thread of their own: a call then never waits for one, and verdicts
@@ -81,6 +82,7 @@ class Campaign:
             check_number(goal, "`goal`", above=0.0)
         self.goal = goal
         self.robot, self.seed, self.background = robot, check_seed(seed), background
+        self._draws = candidates is None
         self.candidates = drawn(robot, CANDIDATES, seed=seed) if candidates is None else _joints(robot, candidates)
         self.target = self.candidates if target is None else _joints(robot, target)
         self.table: Any = None
@@ -266,6 +268,9 @@ class Campaign:
             made = CampaignModel.of(self.robot, table, verdicts, asked, choice, certain=certain)
         except DiffeoCalibError:
             return
+        if self._draws:
+            made = made.with_open_candidates(CANDIDATES, self.seed, table, verdicts)
+            self.candidates = made.asked[0]
         if old is not None and scales is not None:
             made.ratios = list(old.ratios)  # else new scales have yet to show how good they are
             made.selected, made.deviation = old.selected, old.deviation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, pi
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
+from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -22,7 +24,7 @@ from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.bodies import bodies_of
@@ -61,6 +63,7 @@ class CampaignModel:
         posterior: of the accepted rows but the last ones. window: numbers of the last rows.
         last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
         compared: see :func:`_compared`. ratios: of the squares of accepted rows, see :attr:`Measure.ratio`.
+        open: (M,) boolean, candidates that can be measured.
     """
 
     placed: Placed
@@ -77,6 +80,7 @@ class CampaignModel:
     taken: Tensor
     compared: Tensor
     ratios: list[float]
+    open: Tensor
 
     @classmethod
     def of(
@@ -114,7 +118,9 @@ class CampaignModel:
         found, data = chosen.selection.scales, chosen.data
         later: Any = None
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
-        made = cls(placed, data, found, *counts, asked, later, [], later, later, later, []).rebuilt(table, verdicts)
+        made = cls(placed, data, found, *counts, asked, later, [], later, later, later, [], later).rebuilt(
+            table, verdicts
+        )
         if certain and known is None:
             made.deviation = scales_deviation(data, found, made.target, made.compared)
         return made
@@ -138,7 +144,19 @@ class CampaignModel:
         last = posterior.see(Rows.of(self.around(table, window).data, self.scales))
         taken = _flags([verdicts[row].accepted for row in window])
         own = {"posterior": posterior, "window": window, "last": last, "taken": taken, "ratios": list(self.ratios)}
-        return replace(self, **own, seen=len(table), compared=_compared(self.placed, asked[0]))
+        own |= {"compared": _compared(self.placed, asked[0]), "open": self.placed.sees(self.asked[0])}
+        return replace(self, **own, seen=len(table))
+
+    def with_open_candidates(self, count: int, seed: int, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
+        """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
+        if bool(self.open.all()):
+            return self
+        robot = self.placed.registration.geometry.chain
+        with suppress(InputError):  # hardly any can
+            near = ranges_around(robot, self.placed.data.q)
+            q = candidates(robot, count, keep=self.placed.sees, ranges=near, seed=seed)
+            return replace(self, asked=(q, self.asked[1])).rebuilt(table, verdicts)
+        return self
 
     @property
     def expected_error(self) -> float:

@@ -1,7 +1,7 @@
 """The next poses of a campaign: greedily those that lower the variance over the target most, and a forecast.
 
 The gain of a candidate is that of planning/knowledge.py, with the covariance by the accepted rows. Each candidate is
-measured like the last row of the campaign, whatever that was.
+measured like the last row of the campaign, whatever that was; if that was an image, where its camera sees the board.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Next:
 def planned(model: CampaignModel, count: int, goal: float | None) -> Next:
     """The next poses; arguments as of :meth:`Campaign.next`."""
     candidates = model.asked[0]
-    steps = min(len(candidates), max(count, MOST_STEPS if goal is not None else 0))
+    steps = min(int(model.open.sum()), max(count, MOST_STEPS if goal is not None else 0))
     rows, variances = _greedy(model, steps)
     expected = [(3 * value) ** 0.5 for value in variances]
     chosen = rows[:count]
@@ -56,11 +56,12 @@ def _greedy(model: CampaignModel, steps: int) -> tuple[list[int], list[float]]:
     C, own = J @ K[:size, size:], K[size:, size:] + options.noises
     r = len(own) // M  # all are measured like one row
     variances, order = [float(((J @ K[:size, :size]) * J).sum(1).mean())], list[int]()
-    index = torch.arange(M, device=K.device)
+    index, closed = torch.arange(M, device=K.device), (~model.open).nonzero()[:, 0].tolist()
     for _ in range(steps):
         each = C.view(len(C), M, r).transpose(0, 1)  # (M, targets, r)
         gains = torch.linalg.solve(own.view(M, r, M, r)[index, :, index], each.mT @ each).diagonal(dim1=1, dim2=2)
-        gains = gains.sum(1).index_fill(0, torch.tensor(order, dtype=torch.int64, device=K.device), -torch.inf)
+        out = torch.tensor([*closed, *order], dtype=torch.int64, device=K.device)
+        gains = gains.sum(1).index_fill(0, out, -torch.inf)
         best = int(gains.argmax())
         mine = slice(best * r, best * r + r)
         low = torch.linalg.cholesky(own[mine, mine])

@@ -101,7 +101,7 @@ class HandEye:
         carried = poses_from_marks(geometry.tool[None], lever)
         to_pose = pose_directions(carried, lever)[0]  # (6, 9)
         known = to_pose @ _covariance(fitted, geometry.slices["tool"]) @ to_pose.mT
-        frame = _Frame.of(model, camera)
+        frame = SessionFrame.of(model, camera)
         standing = inverse_poses((frame.transform @ geometry.base)[None])[0]
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
         moved = -torch.eye(6, dtype=standing.dtype, device=standing.device)
@@ -143,7 +143,7 @@ def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
     yield from (line for own in [*found.values()][:1] for line in own.board.known.sentences(f"board {own.board.where}"))
 
 
-class _Frame(NamedTuple):
+class SessionFrame(NamedTuple):
     """The measuring frame of a session.
 
     Args:
@@ -156,7 +156,7 @@ class _Frame(NamedTuple):
     twists: Tensor | None = None
 
     @classmethod
-    def of(cls, model: CalibratedKinematics, name: str | None) -> _Frame:
+    def of(cls, model: CalibratedKinematics, name: str | None) -> SessionFrame:
         """By the rows of the session in the fit."""
         eye = torch.eye(4, dtype=model.geometry.base.dtype, device=model.geometry.base.device)
         own = next((own for own in model.placement if own.kind == SESSION and name in own.names), None)

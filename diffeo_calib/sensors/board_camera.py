@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.images import UNKNOWNS, Camera
+from diffeo_calib.cameras.images import UNKNOWNS, Camera, View
 
 CAMERA = "camera"
 SIZE = len(UNKNOWNS)
@@ -47,6 +47,9 @@ class Explained:
         )
 
 
+EXPLAINED = len(fields(Explained))
+
+
 @dataclass(frozen=True, eq=False)
 class BoardCamera:
     """A camera, whether it is on the tool (else the board is), and what it explains."""
@@ -60,19 +63,25 @@ class BoardCamera:
         """All of it as the constants of a device."""
         camera, unknowns = self.camera, self.camera.unknowns
         own = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
+        own += [*astuple(self.explained), *([] if camera.view is None else camera.view.numbers)]
         root = unknowns.new_zeros(SIZE, SIZE)
         known = camera.root if camera.root.shape[1] <= SIZE else torch.linalg.qr(camera.root.mT).R.mT
         root[:, : known.shape[1]] = known
-        return torch.cat([unknowns.new_tensor([*own, *astuple(self.explained)]), root.flatten(), unknowns])
+        return torch.cat([unknowns.new_tensor(own), root.flatten(), unknowns])
 
     @classmethod
     def of(cls, numbers: Tensor) -> BoardCamera | None:
-        """The inverse of :attr:`numbers`; None for models of earlier versions, which keep lens and board alone."""
+        """The inverse of :attr:`numbers`; None for models of earlier versions, which keep lens and board alone.
+
+        Models of other earlier versions do not know what the images showed.
+        """
         if len(numbers) <= SIZE:
             return None
         own, root, unknowns = numbers.split([len(numbers) - SIZE * (SIZE + 1), SIZE * SIZE, SIZE])
-        on_tool, width, height, half_size, noise, *explained = own.tolist()
-        camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise)
+        head, view = own[: 5 + EXPLAINED], own[5 + EXPLAINED :]
+        on_tool, width, height, half_size, noise, *explained = head.tolist()
+        known = View.from_numbers(view) if len(view) else None
+        camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise, known)
         return cls(camera, bool(on_tool), Explained(*explained))
 
 

@@ -193,10 +193,10 @@ def noise_covariance(scales: dc.Hyperparameters, setting: Setting, theta: Tensor
     else:
         assert data.lever is not None
         slack = 0.1 * setting.identification.noise
-        if data.covariance is not None:  # no larger than the smallest known deviation of poses, of 6 freedoms in 9
+        if data.covariance is not None:  # 0.3 of the smallest known deviation of poses, of 6 freedoms in 9
             smallest = torch.linalg.eigvalsh(data.covariance)[:, 3]
             smallest = smallest[smallest > 1e-14]
-            slack = min(slack, float(smallest.median().sqrt())) if len(smallest) else slack
+            slack = min(slack, 0.3 * float(smallest.median().sqrt())) if len(smallest) else slack
         R += (slack**2 + 1e-14) * torch.eye(m, dtype=torch.float64)
         modes = body_modes(data.poses, data.lever)
         for k in range(6):

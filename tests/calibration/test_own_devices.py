@@ -18,7 +18,7 @@ from product_bank import simulated_poses
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat

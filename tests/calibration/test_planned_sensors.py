@@ -14,7 +14,7 @@ from kind_bank import kind_named, rigid_rms
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm

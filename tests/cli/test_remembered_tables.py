@@ -12,7 +12,7 @@ from kind_bank import Kind, kind_named
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cli.commands.correct import _reason
 from diffeo_calib.cli.options import Angle, Length, Rows, Units
 from diffeo_calib.cli.tables import rows_in_table

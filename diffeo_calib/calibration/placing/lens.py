@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,9 +12,12 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.cameras.board import LENS
+from diffeo_calib.cameras.seeing import sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.images import SharedErrors
+from diffeo_calib.measurements.pose_frames import inverse_poses
+from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
 from diffeo_calib.sensors.places import PlacedDevices
@@ -87,12 +90,13 @@ class LensAndBoard(CameraErrors):
     """Lenses and board of a calibration.
 
     Args:
-        on_tool: whether the camera is on the tool, else the board.
+        on_tool: whether the camera is on the tool, else the board. lever: of the poses, m.
         apart: (M, 9, c) the same effects apart from the places of the robot and of what is on the tool.
         explained: at the tool, by the rows of each camera; what the fit says is zero before it.
     """
 
     on_tool: bool
+    lever: float
     apart: Tensor
     explained: tuple[Explained, ...]
 
@@ -121,7 +125,9 @@ class LensAndBoard(CameraErrors):
             apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             on_tool = data.board is not None
-            found.append(cls(shared, rows, on_tool, apart.view_as(shared.slopes), tuple(explained)))
+            found.append(
+                cls(shared, rows, on_tool, data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained))
+            )
             found[-1].check_size(relative_size(data, registration, others))
         return found
 
@@ -152,6 +158,17 @@ class LensAndBoard(CameraErrors):
             explained.append(replace(self.explained[number], **known))
             cameras[name] = replace(camera, unknowns=camera.unknowns + change, root=root)
         return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
+
+    def sees(self, row: int, points: Tensor, frames: Mapping[str, Tensor]) -> Tensor:
+        """See :class:`DeviceSet`: whether the camera of the row sees its board."""
+        number = self.shared.seen_by[self.rows == row].tolist()
+        if not number:
+            return super().sees(row, points, frames)
+        name, camera = [*self.shared.cameras.items()][number[0]]
+        poses = poses_from_marks(points, self.lever)
+        for T in [T for set_up, T in frames.items() if set_up.partition("/")[0] == name][-1:]:
+            poses = T @ poses
+        return sees(camera, inverse_poses(poses) if self.on_tool else poses)
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""

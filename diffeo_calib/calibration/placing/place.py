@@ -185,6 +185,10 @@ class Placed:
                 return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
         return shown_unit("m")
 
+    def sees(self, q: Tensor) -> Tensor:
+        """(M,) boolean: configurations that can be measured as the last row was: by a camera that sees its board."""
+        return self.placement.sees(len(self.data) - 1, self.identification.geometry.points(q))
+
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
 

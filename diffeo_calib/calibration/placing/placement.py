@@ -9,7 +9,7 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, TypeVar
@@ -156,6 +156,18 @@ class DeviceSet(ABC):
         """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
         return ()
 
+    def frames(self) -> Mapping[str, Tensor]:
+        """Name of a set-up -> (4, 4) from the model's frame to its, m; none if all rows are in the model's."""
+        return {}
+
+    def sees(self, row: int, points: Tensor, frames: Mapping[str, Tensor]) -> Tensor:
+        """(M,) boolean: whether points (M, P, 3), m, can be measured as a row was, as far as these devices measured it.
+
+        Args:
+            row: number in the table. points: of the model. frames: those of all devices.
+        """
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+
     @abstractmethod
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -193,6 +205,14 @@ class Placement:
     def doubts(self, data: SeenRows) -> list[Cause]:
         """What all devices are said to hold."""
         return [cause for own in self.sets for cause in own.doubts(data)]
+
+    def sees(self, row: int, points: Tensor) -> Tensor:
+        """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""
+        frames = {name: T for own in self.sets for name, T in own.frames().items()}
+        found = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        for own in self.sets:
+            found &= own.sees(row, points, frames)
+        return found
 
     def shared(self, data: SeenRows) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""

@@ -245,6 +245,10 @@ class SessionFrames(Sessions):
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
 
+    def frames(self) -> dict[str, Tensor]:
+        """See :class:`DeviceSet`."""
+        return dict(zip(self.names, self.transforms, strict=True))
+
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         """See :class:`DeviceSet`."""
         session, points, count = self.session[own.rows], own.table.points, self.markers

@@ -138,6 +138,8 @@ FIRST_DRAWS = 100_000
 REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
 """Damped Gauss-Newton steps that bring a ball to its place, the longest of a joint [rad or m], and their damping."""
 REACHED_M = 1e-4
+BEYOND_SHARE = 0.25
+"""Of the range of a joint, how far beyond it configurations are near those that have it."""
 LEAST_SHARE = 1e-3
 """Share of the draws that must be accepted, judged from the first draws on: below it the search would not end."""
 
@@ -250,6 +252,14 @@ def joint_ranges(robot: Tree, ranges: Mapping[str, Sequence[float]] | None = Non
     ]
     lower, upper = torch.tensor(ends, dtype=torch.float64, device=HOST).unbind(1)
     return lower, upper
+
+
+def ranges_around(robot: Tree, q: Tensor) -> dict[str, tuple[float, float]]:
+    """Ranges of the joints not far beyond those of configurations (M, n): for what few others show."""
+    low, high = q.aminmax(dim=0)
+    more, (least, most) = BEYOND_SHARE * (high - low), robot.limits.to(q).unbind(1)
+    ends = torch.stack([torch.maximum(low - more, least), torch.minimum(high + more, most)], 1).tolist()
+    return {name: (lower, upper) for name, (lower, upper) in zip(robot.joint_names, ends, strict=True)}
 
 
 def _given(name: str, ends: object, limits: Sequence[float]) -> tuple[float, float]:

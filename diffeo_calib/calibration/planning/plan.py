@@ -23,7 +23,8 @@ from diffeo_calib.calibration.planning.knowledge import (
     registered_rows,
     tool_of,
 )
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, sensor_of
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
@@ -324,7 +325,8 @@ def _options(
     open_ = whole.rows >= first
     reachable = len(whole.rows[open_].unique())
     if reachable < count:
-        fix = "pass other candidates: those at which the devices see the ball, or that bring it to its sockets"
+        fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
+        fix += "its sockets"
         what = "candidates that can be measured"
         raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
     return whole, open_, (whole.rows < first).nonzero()[:, 0].tolist()

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.planning.candidates import Criterion
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -21,14 +22,9 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
-from diffeo_calib.sensors.places import PlacedDevices
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
-SAME_SLOPES = 0.05
-"""Largest difference of slopes of a device that was recognised, relative to those of a distance."""
-MOST_NUMBERS = 2
-"""Of a reading; rows that report more tell coordinates."""
 
 
 class Scene(NamedTuple):
@@ -77,6 +73,13 @@ class Scene(NamedTuple):
     def framed(self) -> bool:
         """Whether the points represent frames."""
         return len(self.averaged) < self.points.shape[1]
+
+
+class Where(NamedTuple):
+    """Configurations that can be measured: arguments of :func:`candidates`."""
+
+    keep: Criterion
+    ranges: dict[str, tuple[float, float]]
 
 
 class Options(NamedTuple):
@@ -173,6 +176,14 @@ class Sensor(ABC):
 
         Args:
             base: (4, 4) the base in the frame of the model's positions, m.
+        """
+        return None
+
+    def where(self, model: CalibratedKinematics) -> Where | None:
+        """Where it can measure, for :func:`candidates`; None if nothing is known of that before.
+
+        Args:
+            model: of the fit that the sensor belongs to.
         """
         return None
 
@@ -332,90 +343,3 @@ class InSockets(Sensor):
             shared = self.effects[device]
         names = tuple(f"socket {number}" for number in range(1, len(places) + 1))
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, names)
-
-
-def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
-    """What the rows of a model were measured with, devices of readings and sockets where the fit found them.
-
-    Where the model does not know its devices (files of old versions, and registered models) they are read off the map,
-    which keeps the slopes of its rows and the effects of its devices.
-    """
-    fitted, q, known = model.map, model.configurations, _known_devices(model)
-    shared, visible = fitted.noise.shared, fitted.noise.visible
-    moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
-    read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
-    for rows, _ in known:
-        read[rows] = True
-    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & of_ball
-    device = Positions(whole=model.lever is not None)
-    found: list[Sensor] = [device] if bool((~read & ~resting).any()) else []
-    if bool(resting.any()):
-        found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
-    if known:
-        return (*found, *(DeviceReadings(None, devices, moved[rows].any(0)) for rows, devices in known))
-    for own in moved[read].unique(dim=0) if bool(read.any()) else ():
-        rows = (moved == own).all(1) & read
-        found.append(_device(model, (rows, own), _name(model, rows)))
-    return tuple(found)
-
-
-def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
-    """Every device of readings of a model by itself, and the rows (M,) of the fit that it measured."""
-    found, noise = [], model.map.noise
-    for one in model.placement:
-        for number in one.device.unique().tolist() if one.devices is not None else ():
-            rows, kind = one.rows[one.device == number].to(noise.shared.device), known_kinds()[one.kind]
-            effects = noise.shared[rows[0], noise.visible[rows[0]]]
-            offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
-            prior, name = one.constants.new_tensor(kind.prior(offset)), _called(model, one, number)
-            found.append((rows, kind((name,), one.constants[number, None], prior)))
-    return found
-
-
-def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
-    """The sockets of a fit by its rows: places (N, 3) of the ball, m, and effects (N, 3, c)."""
-    _, which = effects.flatten(1).unique(dim=0, return_inverse=True)
-    rows = [which == number for number in range(int(which.max()) + 1)]
-    first = torch.stack([effects[own][0] for own in rows])
-    return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
-
-
-def _name(model: CalibratedKinematics, rows: Tensor) -> str:
-    """Name of the device that measured some rows (N,) of a fit, after its kind where another kind has the same name.
-
-    Files of old versions hold no names.
-    """
-    first = int(rows.nonzero()[0, 0])
-    for own in model.placement:
-        for name, row in zip([own.names[number] for number in own.device.tolist()], own.rows.tolist(), strict=True):
-            if row == first:
-                return _called(model, own, own.names.index(name))
-    return f"device of row {first}"
-
-
-def _called(model: CalibratedKinematics, own: PlacedDevices, number: int) -> str:
-    """Name of a device, after its kind where another kind has the same name."""
-    name = own.names[number]
-    return name if sum(name in other.names for other in model.placement) == 1 else f"{own.kind} {name}"
-
-
-def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) -> DeviceReadings:
-    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects."""
-    (rows, columns), fitted = own, model.map
-    if fitted.slopes is None:
-        raise InputError.of("a model of readings", expected="slopes of its rows")
-    numbers, ball = fitted.noise.visible[rows][0], model(model.configurations[rows]).detach()[:, -1]
-    slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
-    for kind in known_kinds().values():
-        deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
-        if len(deviations) != effects.shape[2]:
-            continue
-        constants = kind.seen_by(slopes, effects / deviations, ball)
-        if constants is None:
-            continue
-        devices = kind((name,), constants[None], deviations)
-        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
-        if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
-            return DeviceReadings(None, devices, columns)
-    fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
-    raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)

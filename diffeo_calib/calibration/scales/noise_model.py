@@ -44,12 +44,14 @@ SMALLEST_NOISE_M = 1e-7
 FREEDOM_OF_POSES = 6
 SLACK_SHARE = 0.1
 """Noise of the single points of a pose, relative to the residual of the geometric calibration."""
+FINEST_SHARE = 0.3
+"""The same relative to the finest direction of known errors: it adds a tenth to their variance."""
 
 
 def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
     """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
 
-    A larger slack would drown what images of a board tell across the line of sight: a hundredth of the error along it.
+    A slack of that size would drown what images of a board tell across the line of sight: a tenth of that along it.
     """
     size = 0 if known is None else known.shape[1] // bodies
     if known is None or size < FREEDOM_OF_POSES:
@@ -91,7 +93,7 @@ class NoiseModel:
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
         size, known = data.bodies.points, data.covariance
         count = data.markers // size
-        slack = min(SLACK_SHARE * residual, _precision(known, count, residual))
+        slack = min(SLACK_SHARE * residual, FINEST_SHARE * _precision(known, count, residual))
         own = count, 3 * size, known, data.bodies.modes(data), slack
         return cls(*own, visible=visible, kinds=data.body_kinds)
 

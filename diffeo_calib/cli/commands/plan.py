@@ -11,10 +11,10 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import Tracker, candidates, collision_free
+from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, candidates, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
-from diffeo_calib.calibration.planning.sensors import Sensor
+from diffeo_calib.calibration.planning.sensors import Sensor, Where
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned, StoredUnits
@@ -119,10 +119,18 @@ def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:
 
 
 def _random(
-    cell: Candidates, robot: Tree, marker: Tensor, count: int, *, places: Tensor | None, table: TableFormat
+    cell: Candidates,
+    robot: Tree,
+    marker: Tensor,
+    count: int,
+    *,
+    places: Tensor | None,
+    table: TableFormat,
+    where: Where | None,
 ) -> Tensor:
     """Random configurations (count, n) that respect the cell, rad or m."""
     scale, tracker, column = table.per_metre, None, None
+    keep = None if where is None else where.keep
     if cell.tracker is None and not (cell.facing is None and cell.cone is None):
         raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
     if cell.tracker is not None:
@@ -135,8 +143,8 @@ def _random(
     return candidates(
         robot,
         count,
-        ranges=_ranges(cell, robot, table),
-        keep=collision_free(robot) if cell.collisions else None,
+        ranges=({} if where is None else where.ranges) | _ranges(cell, robot, table),
+        keep=_both(keep, collision_free(robot)) if cell.collisions else keep,
         tracker=tracker,
         floor=None if cell.floor is None else cell.floor / scale,
         column=column,
@@ -144,6 +152,19 @@ def _random(
         ball=marker,
         seed=cell.seed,
     )
+
+
+def _both(first: Criterion | None, second: Criterion) -> Criterion:
+    """Whether both allow a configuration; the second one is asked only where the first does."""
+    if first is None:
+        return second
+
+    def criterion(q: Tensor) -> Tensor:
+        found = first(q)
+        found[found.clone()] = second(q[found])
+        return found
+
+    return criterion
 
 
 def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list[float]]:
@@ -170,14 +191,18 @@ def _drawn(
     """Random configurations, shared by sensors that need the ball in their sockets and those that do not."""
     cell, table = how
     robot, base = _robot_and_base(given)
-    parts = [one.places_in(base) for one in sensors]
-    held = [places for places in parts if places is not None]
-    anywhere, found = len(parts) - len(held), []
-    for number, places, marker in ((anywhere, None, markers.mean(0)), (len(held), held, markers[-1])):
+    held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
+    wheres = [one.where(given) for one in sensors] if isinstance(given, CalibratedKinematics) else []
+    seen, found = [where for where in wheres if where is not None], []
+    each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
+        (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
+        *((1, None, markers.mean(0), where) for where in seen),
+        (len(held), torch.cat(held) if held else None, markers[-1], None),
+    ]
+    for number, places, marker, where in each:
         if number:
-            where = None if places is None else torch.cat(places)
-            share = -(-count * number // len(parts))
-            found.append(_random(cell, robot, marker, share, places=where, table=table))
+            share = -(-count * number // len(sensors))
+            found.append(_random(cell, robot, marker, share, places=places, table=table, where=where))
     return torch.cat(found)
 
 

@@ -1,0 +1,133 @@
+"""Images of a board, as what will measure planned poses: where the camera sees it, and what an image there would tell.
+
+An image tells the pose of the board in the camera with an error of its own, far larger along the line of sight, and one
+that all images share, of lens and board (cameras/images.py). Both depend on the pose. The arm is not seen: it may hide
+the board.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.planning.candidates import ranges_around
+from diffeo_calib.calibration.planning.sensors import Options, Scene, Sensor, Where
+from diffeo_calib.cameras.images import Camera
+from diffeo_calib.cameras.seeing import expected, sees
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.hand_eye import SessionFrame
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
+from diffeo_calib.measurements.poses import mark_jacobian, poses_from_marks
+from diffeo_calib.sensors.board_camera import BoardCamera
+from diffeo_calib.sensors.places import SESSION, PlacedDevices
+
+SMALLEST_REST_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardImages(Sensor):
+    """Images of the board by one camera of a fit.
+
+    Args:
+        name: of the camera. seen: lens, board and what its images showed. lever: of the model's poses, m.
+        frame: the measuring frame in which it stands.
+        effects: (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a
+            registration. rest: (9, 9) noise of a pose beyond that of its corners, m^2.
+    """
+
+    name: str = ""
+    seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
+    lever: float = 0.0
+    frame: SessionFrame = None  # pyright: ignore[reportAssignmentType]
+    effects: Tensor | None = None
+    rest: Tensor | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """Lens and board."""
+        return self.seen.camera
+
+    def boards(self, points: Tensor) -> Tensor:
+        """Poses (M, 4, 4) of the board in the camera's frame by the model's points (M, 9), m."""
+        poses = self.frame.transform @ poses_from_marks(points.unflatten(1, (3, 3)), self.lever)
+        return inverse_poses(poses) if self.seen.on_tool else poses
+
+    def where(self, model: CalibratedKinematics) -> Where:
+        """See :class:`Sensor`; by the rigid kinematics, which is quick, and not far beyond the joints of the fit."""
+        ranges = ranges_around(model.robot, model.configurations)
+        return Where(lambda q: sees(self.camera, self.boards(model.geometry.points(q).flatten(1))), ranges)
+
+    def tells(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
+        boards = self.boards(points)
+        covariance, effects = expected(self.camera, boards)
+        if self.seen.on_tool:
+            slopes = -camera_jacobian(inverse_poses(boards), self.lever, boards[:, :3, 3])
+        else:
+            slopes = mark_jacobian(poses_from_marks(points.unflatten(1, (3, 3)), self.lever), self.lever)
+            slopes = slopes @ torch.block_diag(*[self.frame.transform[:3, :3].mT] * 2)
+        return slopes @ covariance @ slopes.mT, slopes @ effects
+
+    def options(self, scene: Scene) -> Options:
+        """See :class:`Sensor`: where the camera sees the board."""
+        rows = sees(self.camera, self.boards(scene.points)).nonzero()[:, 0]
+        points = scene.points[rows]
+        eye = torch.eye(9, dtype=points.dtype, device=points.device)
+        if self.camera.view is None:  # of earlier versions
+            noise, shared = scene.noise[rows], points.new_zeros(len(rows), 9, scene.shifts)
+        else:
+            noise, by_lens = self.tells(points)
+            noise = noise + (0.0 if self.rest is None else self.rest)
+            shared = by_lens @ (self.camera.root if self.effects is None else self.effects)
+            shared = self._new(scene, shared) if self.effects is None else shared
+        if self.frame.columns is not None and self.frame.twists is not None and scene.shifts:
+            turned = frame_slopes(points.unflatten(1, (-1, 3)), points.new_zeros(3)) @ self.frame.twists
+            shared = shared.index_add(2, self.frame.columns.nonzero()[:, 0], turned)
+        noise = noise if self.std is None else self.std**2 * eye.expand_as(noise)
+        return Options(rows, eye.expand(len(rows), 9, 9), shared, noise, torch.zeros_like(rows), (self.name,))
+
+
+def board_images(model: CalibratedKinematics, placed: PlacedDevices) -> list[Sensor]:
+    """Those of the cameras of a fit; none of other devices."""
+    return [_of_camera(model, placed, number, seen) for number, seen in enumerate(placed.cameras.values())]
+
+
+def _of_camera(model: CalibratedKinematics, placed: PlacedDevices, number: int, seen: BoardCamera) -> BoardImages:
+    """One camera, where it stood last."""
+    rows, noise = placed.rows[placed.device == number], model.map.noise
+    frame = SessionFrame.of(model, _last_session(model, rows))
+    found = BoardImages(None, placed.names[number], seen, model.bodies.pose_lever(), frame)
+    if seen.camera.view is None or model.registration is not None:
+        return found
+    stood = _same_session(model, rows)
+    points = model(model.configurations[stood]).detach().flatten(1)
+    known, by_lens = found.tells(points)
+    of_fit = noise.shared[stood][:, :9].clone()
+    if frame.columns is not None:
+        of_fit[..., frame.columns] = 0.0
+    effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
+    beyond = (noise.covariance[stood][:, :9, :9] - known).median(0).values
+    values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
+    rest = (axes * values.clamp(min=SMALLEST_REST_M**2)) @ axes.mT
+    return BoardImages(None, found.name, seen, found.lever, frame, effects, rest)
+
+
+def _last_session(model: CalibratedKinematics, rows: Tensor) -> str | None:
+    """Name of the session of the last of some rows; None where there are none, and in the place of a registration."""
+    for own in model.placement if model.registration is None else ():
+        if own.kind == SESSION and len(own.rows):
+            here = torch.isin(own.rows, rows)
+            return own.names[int(own.device[here][own.rows[here].argmax()])] if bool(here.any()) else None
+    return None
+
+
+def _same_session(model: CalibratedKinematics, rows: Tensor) -> Tensor:
+    """Those of some rows that are of the session of the last one."""
+    name = _last_session(model, rows)
+    for own in model.placement if name is not None else ():
+        if own.kind == SESSION:
+            return rows[torch.isin(rows, own.rows[own.device == own.names.index(name)])]
+    return rows
