@@ -188,9 +188,18 @@ class CameraPoints(Observation):
         """Points in the camera's frame (N, 3), m."""
         return (self.poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + self.poses[:, :3, 3]
 
+    def _in_front(self, points: Tensor) -> Tensor:
+        """The same, none of them behind its camera."""
+        seen = self._seen(points)
+        behind = (seen[:, 2] < SMALLEST_DISTANCE_M).nonzero()[:, 0]
+        if len(behind):
+            fix = "check the camera's pose: it is the transform from the measuring frame to the camera"
+            raise InputError.of(f"row {int(behind[0])} is behind its camera", fix=fix)
+        return seen
+
     def value(self, points: Tensor) -> Tensor:
         """Image coordinates (N, 2)."""
-        seen = self._seen(points)
+        seen = self._in_front(points)
         return self.focal * seen[:, :2] / seen[:, 2:]
 
     def slope(self, points: Tensor) -> Tensor:
@@ -206,11 +215,7 @@ class CameraPoints(Observation):
 
     def _projection(self, points: Tensor) -> Tensor:
         """Derivatives (N, 2, 3) of the image by the point in the camera's frame."""
-        X, Y, Z = self._seen(points).unbind(1)
-        behind = (Z < SMALLEST_DISTANCE_M).nonzero()[:, 0]
-        if len(behind):
-            fix = "check the camera's pose: it is the transform from the measuring frame to the camera"
-            raise InputError.of(f"row {int(behind[0])} is behind its camera", fix=fix)
+        X, Y, Z = self._in_front(points).unbind(1)
         zero = torch.zeros_like(X)
         rows = [torch.stack([1 / Z, zero, -X / Z**2], 1), torch.stack([zero, 1 / Z, -Y / Z**2], 1)]
         return self.focal[:, None] * torch.stack(rows, 1)

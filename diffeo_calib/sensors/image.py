@@ -23,6 +23,9 @@ from diffeo_calib.sensors.devices import (
 VIEW_HALF_ANGLE_RAD = 0.5
 """Of the field of view of a camera whose poses are planned: 57 degrees in all."""
 
+NEAREST_SHARE = 1.2
+"""Least depth of the middle of the points, as a share of the largest distance of a point from it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Cameras(Devices):
@@ -73,22 +76,14 @@ class Cameras(Devices):
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
-        """Direct linear transformation: (P z) x (u, v, 1) = 0, linear in P; its nearest rigid transform.
-
-        Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
-        """
+        """By projection; by parallel rays where few rows, or points that are not those, put some behind the camera."""
         middle = points.mean(0)
-        size = (points - middle).square().sum(1).mean().sqrt()
-        one = torch.ones_like(points[:, :1])
-        at = torch.cat([(points - middle) / size, one], 1)
-        none = torch.zeros_like(at)
-        above = torch.cat([at, none, -values[:, :1] * at], 1)
-        matrix = torch.cat([above, torch.cat([none, at, -values[:, 1:] * at], 1)])
-        P = torch.linalg.svd(matrix, full_matrices=True).Vh[-1].view(3, 4)
-        P = P * (1.0 if float((at @ P[2]).mean()) >= 0 else -1.0)  # in front of the camera
-        length = torch.linalg.svdvals(P[:, :3]).mean().clamp(min=SMALLEST_M)
-        R = nearest_rotations(P[:, :3])
-        t = P[:, 3] * size / length - R @ middle
+        size = (points - middle).square().sum(1).mean().sqrt().clamp(min=SMALLEST_M)
+        at = (points - middle) / size
+        R, t = _by_projection(values, at)
+        if float((at @ R[2]).min() + t[2]) <= 0:
+            R, t = _by_parallel_rays(values, at)
+        t = t * size - R @ middle
         return torch.cat([transforms(R, t)[:3].flatten(), ((points @ R.mT + t)[:, 2]).mean()[None]])
 
     @property
@@ -138,3 +133,33 @@ class Cameras(Devices):
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
         what = f"camera '{self.names[number]}': {numbers_text(place)} +- {shift:.3f} mm in {frame}"
         return f"{what}, looks along {numbers_text(pose[2, :3].tolist())} +- {turn:.2f} mrad"
+
+
+def _by_projection(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Turn (3, 3) and shift (3,) of a camera by images (N, 2) of points (N, 3).
+
+    Direct linear transformation: (P z) x (u, v, 1) = 0, linear in P; its nearest rigid transform.
+
+    Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
+    """
+    at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
+    none = torch.zeros_like(at)
+    above = torch.cat([at, none, -values[:, :1] * at], 1)
+    matrix = torch.cat([above, torch.cat([none, at, -values[:, 1:] * at], 1)])
+    P = torch.linalg.svd(matrix, full_matrices=True).Vh[-1].view(3, 4)
+    P = P * (1.0 if float((at @ P[2]).mean()) >= 0 else -1.0)  # in front of the camera
+    length = torch.linalg.svdvals(P[:, :3]).mean().clamp(min=SMALLEST_M)
+    return nearest_rotations(P[:, :3]), P[:, 3] / length
+
+
+def _by_parallel_rays(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """The same by a camera far away (scaled orthography), whose images are linear in points around zero.
+
+    Source: D. DeMenthon, L. Davis, "Model-based object pose in 25 lines of code", IJCV 15, 1995, section 2.
+    """
+    middle = values.mean(0)
+    rows = torch.linalg.lstsq(at, values - middle, driver="gelsd").solution.mT  # (2, 3)
+    scale = torch.linalg.svdvals(rows).mean().clamp(min=SMALLEST_M)
+    R = nearest_rotations(torch.cat([rows / scale, torch.linalg.cross(rows[0], rows[1])[None] / scale**2]))
+    depth = torch.maximum(1 / scale, NEAREST_SHARE * at.norm(dim=1).max())
+    return R, depth * torch.cat([middle, torch.ones_like(middle[:1])])

@@ -250,6 +250,12 @@ class Places:
         return Places(frames, devices, ball, found, self.numbers + other.numbers)
 
 
+LARGEST_SHARE = 0.2
+"""Median residual of readings of the rows that are judged, relative to the RMS distance of what they see from its
+middle: wrong rows or units, not a robot that errs."""
+CHECK_READINGS = "check the columns of the readings, their unit, and which device each row names"
+
+
 def sensor_key(data: Readings) -> object:
     """What readings of the same kind of devices have in common."""
     return data.column_kind
@@ -269,11 +275,18 @@ def placed(data: Readings, points: Tensor) -> Devices:
         MeasurementError: too few rows of a device, or readings that no place of it explains.
     """
     check_devices(data)
+    what, fix = "no place of the devices explains the readings", CHECK_READINGS
     try:
-        return fitting_devices(data, points)
+        found = fitting_devices(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
-        fix = "check the columns of the readings, their unit, and which device each row names"
-        raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None
+        raise MeasurementError.of(f"{what} ({error})", fix=fix) from None
+    seen = found.points_of(points)
+    error = float(found.errors(data, seen).square().sum(1).median().sqrt())
+    most = LARGEST_SHARE * float((seen - seen.mean(0)).square().sum(1).mean().sqrt())
+    if error > most:
+        expected = f"residuals well below {1e3 * most:.0f} mm for points that far apart"
+        raise MeasurementError.of(what, expected=expected, got=f"a median of {1e3 * error:.3g} mm", fix=fix)
+    return found
 
 
 SESSION, SOCKET, MOUNTING, DRIFT = "session", "socket", "mounting", "drift"

@@ -159,3 +159,18 @@ def test_places_are_said_with_their_frame(kind: str) -> None:
     devices = KINDS[kind].at(readings(kind), points(Q)[:, 0])
     said = devices.sentence(1, torch.ones_like(devices.deviations), "the measuring frame")
     assert "in the measuring frame" in said
+
+
+def test_cameras_start_in_front_of_points_that_are_not_those() -> None:
+    """Eight images each, points of a ball that is thought elsewhere: projection alone puts some behind the camera."""
+    truth = Cameras(("left", "right"), constants("image"), torch.ones(6).double())
+    behind = 0
+    for seed in range(20):
+        real = 0.7 * normal(16, 3, seed=seed).clamp(-2, 2)
+        data = dc.Readings.images(Q[:16], torch.zeros(16, 2).double(), NAMES[:16], focal=(800.0, 800.0), centre=(0.0, 0.0))
+        data = replace(data, values=truth.observation(data.device).value(real))
+        thought = real + 0.3 * normal(16, 3, seed=seed + 100)
+        found = Cameras.at(data, thought)
+        depth = (found.poses[data.device] @ torch.nn.functional.pad(thought, (0, 1), value=1.0)[..., None])[:, 2, 0]
+        behind += int((depth <= 0).any())
+    assert behind == 0

@@ -95,7 +95,7 @@ def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[Hidde
 
 
 def _precision(K: Tensor) -> tuple[Tensor, int]:
-    """Pseudo-inverse of a covariance, (k, k), and its rank: markers of one body that moved together leave it singular."""
+    """Pseudo-inverse of a covariance, (k, k), and its rank: markers that moved together leave it singular."""
     scale = K.diagonal().sqrt()
     values, Q = torch.linalg.eigh(K / scale / scale[:, None])
     kept = values > RANK_TOLERANCE * values[-1]

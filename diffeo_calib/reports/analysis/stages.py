@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,9 +12,12 @@ from torch import Tensor
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_robustly
+from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
@@ -101,9 +104,24 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
     q = configurations(model, CONFIGURATIONS, seed)
     fitted = model.configurations.to(HOST)
     fitted = fitted[:: -(-len(fitted) // MEASURED)]
-    found = plan(model, q, NEXT, target=q[:TARGETS])
-    deviation = found.known_rms if model.registration is None else claimed(model, q)
+    options = torch.cat([q, *_seen_configurations(model, CONFIGURATIONS, seed)])
+    found = plan(model, options, NEXT, target=q[:TARGETS])
+    deviation = found.known_rms[: len(q)] if model.registration is None else claimed(model, q)
     return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), ExpectedError.of(model), found)
+
+
+def _seen_configurations(model: CalibratedKinematics, count: int, seed: int) -> Iterator[Tensor]:
+    """(count, n) random configurations for each sensor that cannot measure everywhere, such as a camera.
+
+    Those of the fit where hardly any others can be measured.
+    """
+    for sensor in sensor_of(model):
+        where = sensor.where(model)
+        try:
+            if where is not None:
+                yield candidates(model.robot, count, keep=where.keep, ranges=where.ranges, seed=seed)
+        except InputError:
+            yield model.configurations.to(HOST)
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
