@@ -167,7 +167,8 @@ def test_cameras_start_in_front_of_points_that_are_not_those() -> None:
     behind = 0
     for seed in range(20):
         real = 0.7 * normal(16, 3, seed=seed).clamp(-2, 2)
-        data = dc.Readings.images(Q[:16], torch.zeros(16, 2).double(), NAMES[:16], focal=(800.0, 800.0), centre=(0.0, 0.0))
+        none, f = torch.zeros(16, 2).double(), (800.0, 800.0)
+        data = dc.Readings.images(Q[:16], none, NAMES[:16], focal=f, centre=(0.0, 0.0))
         data = replace(data, values=truth.observation(data.device).value(real))
         thought = real + 0.3 * normal(16, 3, seed=seed + 100)
         found = Cameras.at(data, thought)
