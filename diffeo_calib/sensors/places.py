@@ -250,7 +250,7 @@ class Places:
         return Places(frames, devices, ball, found, self.numbers + other.numbers)
 
 
-LARGEST_SHARE = 0.2
+LARGEST_SHARE = 0.5
 """Median residual of readings of the rows that are judged, relative to the RMS distance of what they see from its
 middle: wrong rows or units, not a robot that errs."""
 CHECK_READINGS = "check the columns of the readings, their unit, and which device each row names"

@@ -7,11 +7,13 @@ markers, after a start in closed form (robots/placement.py):
 
 C the posterior covariance of the fit, R that of the noise, V = C + R. With a prior N(mu, P) of u,
 
-    u = mu + A (r - S mu),    A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
+    u = mu + A (r - S mu),    A = ((P + B)^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
 
-R in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors are
-not correlated as C says, and weights by V do harm: on another series of a UR10 more rows made the result worse. The
-covariance U, the test for outliers and the marginal likelihood take all of V.
+B is zero, or the covariance of the markers' old places by the fit, a part of C: where the fit hardly knew a marker, as
+along the axis of a tool that was never tilted, the rows place it, though it stayed. Errors of rows left out choose between
+the two. R in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit,
+errors are not correlated as C says, and weights by V do harm: on another series of a UR10 more rows made the result worse.
+The covariance U, the test for outliers and the marginal likelihood take all of V.
 
 The base may be anywhere. A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one
 (0.3 m); the marginal likelihood of the rows weighs the three, and their mean is taken. Where the rows cannot tell, the
@@ -59,6 +61,7 @@ class Session:
         q: (M, n). points: (M, P, 3) measured, m, NaN where hidden. noise: (M, 3 P, 3 P) m^2, without information there.
         centre: (3,) about which the frame turns, m.
         known: (6 + d, 6 + d) covariance of frame and body from an earlier registration; zero without one.
+        by_fit: (6 + d, 6 + d) covariance of the body's old place by the fit, zero elsewhere; C includes it.
         frame_free, body_free: what may have moved.
         ball: whether the last point is a ball that no row shows: it stays where it was on the tool.
     """
@@ -71,6 +74,7 @@ class Session:
     noise: Tensor
     centre: Tensor
     known: Tensor
+    by_fit: Tensor
     frame_free: bool
     body_free: bool
     ball: bool = False
@@ -167,6 +171,7 @@ class Estimate:
     Args:
         T: (4, 4). body: where the markers sit. rows: the session linearised there. weights: (M,) of the rows.
         free: (f,) numbers of the unknowns that are free. mean: (f,) mu. prior: (f, f) P.
+        by_fit: (f, f) B.
     """
 
     T: Tensor
@@ -176,6 +181,7 @@ class Estimate:
     free: Tensor
     mean: Tensor
     prior: Tensor
+    by_fit: Tensor
 
     @cached_property
     def factor(self) -> Tensor:
@@ -203,10 +209,10 @@ class Estimate:
 
     @cached_property
     def gain(self) -> Tensor:
-        """A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1 (f, M m)."""
+        """A = ((P + B)^-1 + S^T R^-1 S)^-1 S^T R^-1 (f, M m)."""
         S = self.rows.slopes[..., self.free]
         weighted = torch.linalg.solve(self.rows.noise, S)  # (M, m, f)
-        inverse = torch.linalg.inv(torch.linalg.inv(self.prior) + (weighted.mT @ S).sum(0))
+        inverse = torch.linalg.inv(torch.linalg.inv(self.prior + self.by_fit) + (weighted.mT @ S).sum(0))
         return inverse @ weighted.flatten(0, 1).mT
 
     @cached_property
@@ -269,6 +275,13 @@ class Estimate:
         errors = torch.linalg.solve(eye - own, left[..., None])[..., 0]
         return errors.masked_fill(~self.rows.visible, nan)
 
+    @property
+    def left_out_square(self) -> float:
+        """Mean square of these, m^2; rows that fit badly count less."""
+        squares = self.left_out.square().nanmean(1)
+        weights = self.weights.clamp(max=1.0)
+        return float((weights * squares).nansum() / weights.sum())
+
     @cached_property
     def inflation(self) -> float:
         """Factor on all variances, one or more, with which 95 % regions hold the rows as placed by all others.
@@ -308,12 +321,21 @@ def row_blocks(V: Tensor, rows: int) -> Tensor:
 
 
 def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:
-    """Gauss-Newton from a start, with the markers within so many metres of their old places (prior deviation).
+    """The better one of :func:`_estimate` with B and without, by errors of rows left out.
 
     Args:
-        start: where to begin. metres: see above.
+        start: where to begin. metres: prior deviation of the markers from their old places, m.
         weights: (M,) of the rows; by default those of Student's t, by iteration.
     """
+    found, by_fit = _estimate(start, metres, weights), start.session.by_fit
+    if float(by_fit.diagonal().max()) <= metres**2 or not start.session.body_free:
+        return found
+    held = replace(start.session, by_fit=torch.zeros_like(by_fit))
+    return min(found, _estimate(start._replace(session=held), metres, weights), key=lambda each: each.left_out_square)
+
+
+def _estimate(start: Place, metres: float, weights: Tensor | None) -> Estimate:
+    """Gauss-Newton from a start; arguments as above."""
     session, T, body, view = start
     free = session.free_unknowns(len(body.from_old)).nonzero()[:, 0]
     deviations = torch.cat([torch.full_like(T[0, :3], PLACES.sought_base_m_rad).repeat(2), body.deviations(metres)])
@@ -323,7 +345,7 @@ def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Esti
     for _ in range(MAX_STEPS):
         mean = torch.cat([torch.zeros_like(deviations[:6]), -body.from_old])[free]
         rows = session.rows_at(T, view, given)
-        found = Estimate(T, body, rows, given, free, mean, prior)
+        found = Estimate(T, body, rows, given, free, mean, prior, session.by_fit[free[:, None], free])
         step = torch.zeros_like(deviations).index_copy(0, free, found.step)
         again = given if weights is not None else found.student_t_weights
         if float(step.abs().max()) < SETTLED and float((again - given).abs().max()) < SETTLED_WEIGHT:

@@ -61,7 +61,8 @@ def session_of(
     _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
     zero = data.points.new_zeros(size, size)
     rows = data.q, data.points, _noise(model.new_noise, data, None), zero[0, :3], zero
-    session = Session(fit, nominal, same, *rows, free != "marker", free != "base", ball)
+    by_fit = zero if not same else _by_fit(fit.with_nominal(nominal.typical), nominal, old, zero)
+    session = Session(fit, nominal, same, *rows, by_fit, free != "marker", free != "base", ball)
     view = session.view(old)
     T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
     earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
@@ -75,6 +76,16 @@ def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
     """The fitted markers (P, 3) in the tip's frame, m."""
     shifts = fit.deformation.momenta.theta[nominal.geometry.slices["tool"]]
     return nominal.geometry.tool + shifts.view(-1, 3)
+
+
+def _by_fit(fit: FittedMap, nominal: GeometryMap, old: Body, zero: Tensor) -> Tensor:
+    """Covariance (6 + d, 6 + d) of the body's place by the fit."""
+    part = nominal.geometry.slices["tool"]
+    numbers = torch.arange(part.start, part.stop, device=zero.device)
+    to = torch.linalg.pinv(old.slopes)
+    found = zero.clone()
+    found[6:, 6:] = to @ fit.parameter_covariance(numbers) @ to.mT
+    return found
 
 
 def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
