@@ -59,7 +59,7 @@ class ErrorTable:
         for name in (name for group in groups for name in names[group]):
             table.add_column(name, justify="right", no_wrap=True)
         for row in self.rows:
-            values = (value for group in groups for value in row[group])
+            values = [float(value) for group in groups for value in row[group]]
             table.add_row(*row[0], *("-" if isnan(value) else f"{value:.4f}" for value in values))
         return table
 
