@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 import reading_bank
 import torch
-from kind_bank import KINDS, Kind, kind_named
+from kind_bank import ELSEWHERE, KINDS, Kind, kind_named
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -158,3 +159,92 @@ def test_a_recalibration_with_rows_of_one_set_up_knows_where_all_of_them_are(nam
         judged = dc.evaluate(found.model, rows.rows([name == one for name in rows.device_names]))
         assert judged.numbers == 0
         assert judged.rms < 3e-4
+
+
+# --- rows that tell nothing, and devices that the model knows ------------------------------------------------------
+
+
+def lone_rows(rows: Any) -> Any:
+    """The first row of every socket, and all rows of other kinds."""
+    names = rows.row_sockets
+    return rows.rows([number for number, name in enumerate(names) if name not in names[:number] or not name])
+
+
+def test_a_row_alone_in_its_socket_shows_no_error() -> None:
+    kind = kind_named("ball in sockets")
+    names = kind.new.row_sockets
+    rows = kind.new.rows([number for number, name in enumerate(names) if name == names[0]] + [names.index("4/1")])
+    found: Any = dc.evaluate(kind.model, rows)
+    assert found.count == len(rows) - 1
+    assert found.errors[-1].isnan()
+    assert found.rms == pytest.approx(dc.evaluate(kind.model, rows.rows(slice(0, -1))).rms)
+    assert any(f"1 of {len(rows)} rows show no error" in line for line in found.placed)
+
+
+@pytest.mark.parametrize("verb", [dc.evaluate, dc.compare, dc.recalibrate])
+def test_rows_that_are_all_alone_in_their_sockets_are_refused(verb: Callable[[Any, Any], Any]) -> None:
+    kind = kind_named("ball in sockets")
+    with pytest.raises(dc.DiffeoCalibError, match=r"2 rows, each of them alone in its socket.*twice"):
+        verb(kind.model, lone_rows(kind.new))
+
+
+def test_beside_positions_rows_alone_in_their_sockets_are_no_accuracy() -> None:
+    kind = kind_named("mixture")
+    found: Any = dc.evaluate(kind.model, lone_rows(kind.new))
+    assert found.kind == "position"
+    assert "2 of 2 rows show no error" in " ".join(found.placed)
+    assert dc.recalibrate(kind.model, lone_rows(kind.moved)).after.positions is not None
+
+
+@pytest.mark.parametrize("name", ["several kinds", "inclinations", "images and a tracker"])
+def test_devices_are_kept_where_positions_alone_are_registered(name: str) -> None:
+    """Twice, by another device each time, and beside it again."""
+    kind = kind_named(name)
+    model, before = kind.model, dc.evaluate(kind.model, kind.new)
+    names = [own.names for own in model.placement]
+    parts: Any = kind.moved.parts
+    (measured,) = (part for part in parts if not part.without_device)
+    for T in (torch.eye(4, dtype=torch.float64), twist_transform(0.5 * ELSEWHERE)):
+        rows = measured.in_frames(T.expand(len(measured), 4, 4))
+        model = model.registered(rows)
+        assert [own.names for own in model.placement] == names
+    judged = dc.Observations.joined([rows, *(part for part in parts if part.without_device)])
+    for again in (model, dc.recalibrate(model, rows).model):
+        found: Any = dc.evaluate(again, judged)
+        assert found.numbers == 0
+        for one, errors in found.items():
+            assert errors.rms < 2.0 * before[one].rms, one  # pyright: ignore[reportIndexIssue]
+
+
+def test_a_marker_in_place_of_the_ball_makes_a_model_forget_its_gauges() -> None:
+    kind = kind_named("distances")
+    q = kind.q(12)
+    rows = dc.Measurements(q, kind.source.truth(q), kind.robot.joint_names)
+    with pytest.warns(dc.DiffeoCalibWarning, match="no longer knows the devices 'device 0', 'device 1', 'device 2'"):
+        found = kind.model.registered(rows)
+    assert not found.placement
+
+
+@pytest.mark.parametrize("on_tool", [True, False])
+def test_poses_of_another_mounting_are_refused(on_tool: bool) -> None:
+    kinds = [kind_named(name) for name in ("poses", "camera on the tool")]
+    own, other = kinds if on_tool else kinds[::-1]
+    with pytest.raises(dc.DiffeoCalibError, match=r"not those of a calibrated robot: expected a median of about 0\.\d"):
+        dc.evaluate(own.model, other.new)
+
+
+@pytest.mark.parametrize("name", ["sessions", "two cameras"])
+def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
+    kind = kind_named(name)
+    found: Any = dc.evaluate(kind.model, kind.new)
+    assert found.numbers == 0
+    first, second = kind.data.session_names
+    known = torch.tensor([own == second for own in kind.new.device_names])
+    few: Any = dc.evaluate(kind.model, kind.new.rows(known.nonzero()[:3, 0]))
+    assert_close(few.errors, found.rows(known).errors[:3], equal_nan=True)
+    new = kind.new.with_sessions([own.replace(first, "new") for own in kind.new.device_names])
+    partly: Any = dc.evaluate(kind.model, new)
+    assert partly.numbers == 6
+    assert sum("away from that of the model" in line for line in partly.placed) == 1
+    assert_close(partly.rows(known).errors, found.rows(known).errors, equal_nan=True)
+    assert partly.rows(~known).rms < 1.2 * found.rows(~known).rms

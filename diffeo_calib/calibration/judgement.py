@@ -17,19 +17,20 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence, w
 from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
+    causes_of,
+    check_possible,
     expected_covariance,
     expected_error,
-    implausible,
-    implausibly_far,
     impossible,
+    positions_of,
+    some_rows,
 )
-from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
+from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places, sensor_key
-from diffeo_calib.sensors.tables import Coordinates, divided, measured_positions
+from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.tables import Coordinates
 
 
 @dataclass(frozen=True)
@@ -206,23 +207,12 @@ def refuse_impossible(model: CalibratedKinematics, places: Places, data: Any, fo
     Args:
         model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
     """
-    for table, _ in divided(data)[1]:
-        devices = places.devices[sensor_key(table)]
-        away = devices.errors(table, devices.points_of(model(table.q).detach())).norm(dim=1)
-        if implausibly_far(model, float(away.median())):
-            what, got = (
-                "these errors are not those of a calibrated robot",
-                f"a median of {1e3 * float(away.median()):.4g}",
-            )
-            fix = "check --length, the columns of --reading, and --session, which names the device of every row"
-            raise MeasurementError.of(what, got=f"{got} mm at the ball", fix=fix)
     seen = positions_of(model, places, data)
-    if seen is None or found.positions is None or not impossible(model, found.positions):
-        return
-    some = _refused_steps(model, seen)
-    if not motions(model, some):
-        refuse_mistakes(model.robot, some)
-    raise MeasurementError(" ".join(_causes(model, some, found.positions)))
+    if seen is not None and found.positions is not None and impossible(model, found.positions):
+        some = _refused_steps(model, seen)
+        if not motions(model, some):
+            refuse_mistakes(model.robot, some)
+    check_possible(model, places, data, found)
 
 
 def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
@@ -235,7 +225,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     if seen is None or found.positions is None:
         return Judgement()
     some = _refused_steps(model, seen)
-    causes = _causes(model, some, found.positions)
+    causes = causes_of(model, some, found.positions)
     if causes:
         return Judgement(causes)
     wrong = contradicted(model, some)
@@ -246,28 +236,10 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
 
 def _refused_steps(model: CalibratedKinematics, data: Measurements) -> Measurements:
     """Evenly chosen rows; MeasurementError if they are out of step with their joints."""
-    some = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
+    some = some_rows(data)
     for step in steps_of(model, some):
         raise MeasurementError(step_text(step))
     return some
-
-
-def _causes(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
-    """What moved, or that these are no errors of a calibrated robot."""
-    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in motions(model, some)]
-    return causes or [text for text in [implausible(model, some, errors)] if text is not None]
-
-
-def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:
-    """The measured positions of a table in the frame of a model, with its markers; None if none was measured.
-
-    A drift that the model knows is undone.
-    """
-    own, drift = measured_positions(data), KnownDrift.of(model)
-    if own is None:
-        return None
-    own = places.aligned(own)
-    return sensor_of(own).with_points(own if drift is None else drift.aligned(own), model)
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:
@@ -320,9 +292,9 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
     """
     new = found.rows(~used.cpu()) if not bool(used.all()) else found
     beside = " not used in the fit" * bool((~used).any())
-    own = [one for one in new.values() if one.unit == unit]
+    own = [one for one in new.values() if one.unit == unit and one.count]
     measured = [
-        Accuracy(one.rms, unit, f"{'' if one.what == 'errors' else f'({one.label}) '}on {len(one.errors)} rows{beside}")
+        Accuracy(one.rms, unit, f"{'' if one.what == 'errors' else f'({one.label}) '}on {one.count} rows{beside}")
         for one in own
     ]
     if unit != "m" and measured:

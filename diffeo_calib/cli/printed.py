@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import isnan
 from typing import Any
 
 import torch
@@ -58,7 +59,8 @@ class ErrorTable:
         for name in (name for group in groups for name in names[group]):
             table.add_column(name, justify="right", no_wrap=True)
         for row in self.rows:
-            table.add_row(*row[0], *(f"{value:.4f}" for group in groups for value in row[group]))
+            values = [float(value) for group in groups for value in row[group]]
+            table.add_row(*row[0], *("-" if isnan(value) else f"{value:.4f}" for value in values))
         return table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:

@@ -9,7 +9,7 @@ Medians are torch's ``nanmedian``, means ``nanmean``.
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, nan
 
 import numpy as np
 import torch
@@ -20,7 +20,9 @@ MOST_FOR_TORCH = 1 << 24
 
 
 def quantile(values: Tensor, fraction: float) -> float:
-    """The value that the given fraction of values does not exceed."""
+    """The value that the given fraction of values does not exceed; NaN of no values."""
+    if not values.numel():
+        return nan
     if values.numel() <= MOST_FOR_TORCH:
         return float(torch.quantile(values, fraction))
     return float(np.quantile(values.cpu().numpy(), fraction))

@@ -18,7 +18,12 @@ from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
-from diffeo_calib.kinematics.re_registration.register_again import devices_beside, register_again, registration_rows
+from diffeo_calib.kinematics.re_registration.register_again import (
+    devices_beside,
+    register_again,
+    registered_devices,
+    registration_rows,
+)
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
@@ -174,7 +179,8 @@ class CalibratedKinematics:
                 largest gives the frame, and the others are placed beside it. The number of markers may differ from that
                 of the fit, and there may be poses where there were markers or the other way round. A ball in sockets,
                 or readings, of a model of such rows, alone or beside positions: the ball stays on the tool, and the
-                new devices are placed around the robot.
+                new devices are placed around the robot. Devices that the model knows and that have no rows here stay
+                where they are.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
                 decide between the same place, a small motion and other markers.
@@ -188,7 +194,8 @@ class CalibratedKinematics:
             MeasurementError: too few rows.
 
         Warns:
-            DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
+            DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain; devices that
+                read a ball or frame that the rows' markers replace, which the model then no longer knows.
         """
         rows = registration_rows(measurements, self)
         check_payload_link(self.nominal.load.link, measurements)
@@ -200,6 +207,7 @@ class CalibratedKinematics:
         found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std, ball=ball)
         known = {"map": found.to(self.configurations.device), "lever": found.registration.lever, "placement": ()}
         seen = self._with(**known, ball=ball)._carrying(self.nominal.load)
+        seen = seen._with(placement=registered_devices(self, seen))
         return seen._with(placement=devices_beside(seen, measurements))
 
     @property

@@ -18,17 +18,18 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import Beside, check_joint_order, check_payload_link, sensor_of
+from diffeo_calib.sensors.coordinates import Beside, check_joint_order, check_payload_link, check_shown, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import MOUNTING, SESSION, MountedMarkers, Places
-from diffeo_calib.sensors.tables import rows_of_one_kind
+from diffeo_calib.sensors.places import MOUNTING, SESSION, MountedMarkers, Places, sensor_key
+from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
 """Median position errors above this fraction of the robot's reach are implausible."""
@@ -72,7 +73,10 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     if not isinstance(data, RowGroups):
         expected = "dc.Measurements, dc.Readings or Observations"
         raise InputError.of("`data`", expected=expected, got=type(data).__name__)
-    found = residuals(kinematics, place(kinematics, data), data)
+    places = place(kinematics, data)
+    found = residuals(kinematics, places, data)
+    if isinstance(kinematics, CalibratedKinematics):
+        check_possible(kinematics, places, data, found)
     return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
 
 
@@ -95,7 +99,8 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
-    """Refuse rows of other joints, tips and kinds than those of a calibrated model."""
+    """Refuse rows of other joints, tips and kinds than those of a calibrated model, and rows that show no error."""
+    check_shown(data)
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
         check_payload_link(kinematics.nominal.load.link, data)
@@ -314,6 +319,50 @@ def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
 def implausibly_far(model: CalibratedKinematics, distance: float) -> bool:
     """Whether a median distance, m, is above a tenth of the robot's reach."""
     return distance > LARGEST_ERROR_PER_REACH * model.robot.reach
+
+
+def check_possible(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
+    """Raise MeasurementError for errors that say nothing about the robot.
+
+    Args:
+        model: a calibrated model. places, data, found: see :func:`residuals`.
+    """
+    for table, _ in divided(data)[1]:
+        devices = places.devices[sensor_key(table)]
+        away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
+        if implausibly_far(model, float(away.median())):
+            what, got = (
+                "these errors are not those of a calibrated robot",
+                f"a median of {1e3 * float(away.median()):.4g}",
+            )
+            fix = "check --length, the columns of --reading, and --session, which names the device of every row"
+            raise MeasurementError.of(what, got=f"{got} mm at the ball", fix=fix)
+    seen = positions_of(model, places, data)
+    if seen is not None and found.positions is not None and impossible(model, found.positions):
+        raise MeasurementError(" ".join(causes_of(model, some_rows(seen), found.positions)))
+
+
+def some_rows(data: Measurements) -> Measurements:
+    """Evenly chosen rows, so many as tell what moved."""
+    return data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
+
+
+def causes_of(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
+    """What moved, or that these are no errors of a calibrated robot."""
+    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in motions(model, some)]
+    return causes or [text for text in [implausible(model, some, errors)] if text is not None]
+
+
+def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:
+    """The measured positions of a table in the frame of a model, with its markers; None if none was measured.
+
+    A drift that the model knows is undone.
+    """
+    own, drift = measured_positions(data), KnownDrift.of(model)
+    if own is None:
+        return None
+    own = places.aligned(own)
+    return sensor_of(own).with_points(own if drift is None else drift.aligned(own), model)
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:

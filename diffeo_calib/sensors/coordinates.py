@@ -7,7 +7,7 @@ middles are found; other devices report readings. :func:`sensor_of` knows the ki
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -124,21 +124,30 @@ class Positions(Sensor):
         return data.with_hidden_ball() if model.ball and data.markers == model.markers - 1 else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
-        """The frames of several set-ups, or of rows that no device shares with the model."""
-        names = {name for name in data.device_names if name}
+        """The frames of set-ups: those that the model knows stay, the others are found.
+
+        The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
+        """
         if data.remounted:
-            return self._mounted(data, beside, names)
-        if len(names) == 1 and names <= set(beside.frames) and not beside.every_session:
-            (name,) = names
-            return Places(SessionPlaces((name,), beside.frames[name][None]))
-        if len(names) > 1 or ((beside.every_session or beside.frames) and names):
-            frames = place_sessions(beside.points(data), data)
-        elif beside.unplaced:
-            frames = place_sessions(beside.points(data), data if names else data.with_sessions([ROWS] * len(data)))
-        else:
+            return self._mounted(data, beside, {name for name in data.device_names if name})
+        if beside.unplaced:
+            data = data.with_sessions([name or ROWS for name in data.device_names])
+        names = {name: name in beside.frames for name in data.device_names if name}
+        known, new = ([name for name in names if names[name] == held] for held in (True, False))
+        frames = SessionPlaces(tuple(known), torch.stack([beside.frames[name] for name in known])) if known else None
+        if new and (len(names) > 1 or beside.every_session or beside.frames or beside.unplaced):
+            found = self._placed(of_devices(data, new), beside)
+            frames = found if frames is None else frames.beside(found)
+        if frames is None:
             return Places()
         found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.sentences()
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
+
+    @staticmethod
+    def _placed(data: Measurements, beside: Beside) -> SessionPlaces:
+        """The frames of all set-ups of some rows, found from them."""
+        found = place_sessions(beside.points(data), data)
+        return replace(found, new=found.names)
 
     def _mounted(self, data: Measurements, beside: Beside, names: set[str]) -> Places:
         """The markers of set-ups between which they were mounted anew: those that are known, the others anew."""
@@ -147,7 +156,8 @@ class Positions(Sensor):
             what = "rows whose markers were mounted anew"
             raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
         if not names <= set(known.names):
-            found = MountedMarkers.of(beside.points(data), data, known.turns)
+            new = of_devices(data, names - set(known.names))
+            found = MountedMarkers.of(beside.points(new), new, known.turns)
             known = known.beside(found) if known.names else found
         return Places(known, found=tuple(known.sentences()), numbers=known.fitted_numbers)
 
@@ -216,9 +226,11 @@ class Contacts(Sensor):
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
-        count = len(set(data.row_sockets) - {""})
-        sentence = f"the middles of {count} sockets were found from these rows"
-        return Places(found=(sentence,), numbers=NUMBERS_OF_A_SOCKET * count)
+        count, lone = len(set(data.row_sockets) - {""}), int(alone(sockets_of(data)[0]).sum())
+        found = [f"the middles of {count} sockets were found from these rows"]
+        if lone:
+            found.append(f"{lone} of {len(data)} rows show no error: they are alone in their socket, so its middle")
+        return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
@@ -307,6 +319,11 @@ class OtherDevices(Sensor):
         return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
 
 
+def of_devices(data: Any, names: Collection[str]) -> Any:
+    """The rows of a table of the devices or set-ups of these names."""
+    return data.rows([number for number, name in enumerate(data.device_names) if name in names])
+
+
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}
 
 
@@ -324,12 +341,28 @@ def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[
         for what, rows in ((ERRORS, ~resting), (SPREAD, resting)):
             if bool(rows.any()):
                 sizes, lines = errors[own.rows[rows]].unflatten(1, (-1, 3)).norm(dim=2), own.table.line_numbers[rows]
+                if what == SPREAD:
+                    sizes = sizes.masked_fill(alone(own.table.socket_numbers[rows])[:, None], torch.nan)
                 kind = "socket" if what == SPREAD else own.table.device_rows().kind
                 found.append((Evaluation(sizes, line_numbers=lines, what=what, kind=kind), own.rows[rows]))
     for one in readings:
         numbers = errors[one.rows[:, None], one.numbers]
         found.append((OtherDevices.in_unit(one.data, one.devices, numbers), one.rows))
     return Evaluations.of(found, len(errors))
+
+
+def alone(socket: Tensor) -> Tensor:
+    """(N,) boolean: rows in sockets of these numbers (N,) whose socket no other row shows."""
+    return (torch.bincount(socket) == 1)[socket]
+
+
+def check_shown(data: Any) -> None:
+    """Raise MeasurementError for rows of any kinds that are all alone in their sockets: they show no error."""
+    socket = data.socket_numbers
+    if bool((socket != NO_SOCKET).all()) and bool(alone(socket).all()):
+        got = f"{len(data)} rows, each of them alone in its socket, whose middle it is"
+        fix = "rest in every socket at least twice, in different poses"
+        raise MeasurementError.of("`data`", expected="rows that show an error", got=got, fix=fix)
 
 
 def sensor_of(data: Any) -> Sensor:

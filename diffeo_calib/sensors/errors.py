@@ -74,7 +74,8 @@ class SocketErrors:
     """Spread and distances of predicted positions.
 
     Args:
-        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one.
+        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a
+            row that is alone in its socket, whose middle it is.
         distances: those whose sockets both have rows.
     """
 
@@ -94,7 +95,8 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> Socket
         for a, b, known in sockets.distances
         if seen[a] and seen[b]
     )
-    away = (middles[socket] - predicted).masked_fill(~inside[:, None], torch.nan)
+    judged = inside & (count > 1)[socket]
+    away = (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan)
     return SocketErrors(away, distances)
 
 
@@ -105,7 +107,8 @@ class Evaluation:
     Args:
         errors: (N, P) distances between predicted and measured markers, m, NaN for hidden markers; for poses (N, T)
             distances of the T frames' origins. In sockets (N, 1) distances from the mean of the positions predicted in
-            the socket: a spread, which is 2 to 6 times smaller than errors. Of readings (N, 1), in ``unit``.
+            the socket: a spread, which is 2 to 6 times smaller than errors; NaN for a row alone in its socket, which
+            shows none. Of readings (N, 1), in ``unit``.
         angles: (N,) angles in rad between predicted and measured orientations, (N, T) of poses on several tips; None if
             only points were measured.
         away: (N, P, r) measured minus predicted numbers, in ``unit``. line_numbers: (N,) of the measurements.
@@ -227,11 +230,11 @@ class Evaluation:
 
     @property
     def max(self) -> float:
-        """Largest size, in ``unit``."""
-        return float(known(self.errors).max())
+        """Largest size, in ``unit``; NaN without any."""
+        return self.quantile(1.0)
 
     def quantile(self, fraction: float) -> float:
-        """The size, in ``unit``, that the given fraction of markers does not exceed."""
+        """The size, in ``unit``, that the given fraction of markers does not exceed; NaN without any."""
         return quantile(known(self.errors), fraction)
 
     @property
@@ -252,7 +255,7 @@ class Evaluation:
     @property
     def angle_max(self) -> float | None:
         """Largest angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(known(self.angles).max().rad2deg())
+        return self.angle_quantile(1.0)
 
     def angle_quantile(self, fraction: float) -> float | None:
         """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
@@ -283,9 +286,12 @@ class Evaluations(Mapping[str, Evaluation]):
     def of(
         cls, found: Iterable[tuple[Evaluation, Tensor]], count: int, placed: Sequence[str] = (), numbers: int = 0
     ) -> Evaluations:
-        """Those of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2."""
+        """Those of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2.
+
+        A kind whose rows all show no error, alone in their sockets, is left out.
+        """
         kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
-        for one, rows in found:
+        for one, rows in ((one, rows) for one, rows in found if one.count):
             taken = sum(other.kind == one.kind for other in kinds.values())
             name = f"{one.kind} {taken + 1}" if taken else one.kind
             kinds[name], index[name] = one, rows
@@ -305,11 +311,12 @@ class Evaluations(Mapping[str, Evaluation]):
         return f"Evaluations({kinds}; {self.numbers} numbers found from these rows)"
 
     def rows(self, mask: Tensor) -> Evaluations:
-        """The errors of some rows, chosen by a mask (N,); kinds without a row are left out."""
+        """The errors of some rows, chosen by a mask (N,); kinds without an error are left out."""
         mask = mask.cpu()
         some = {
             kind: found.rows(mask[self.index[kind]]) for kind, found in self.items() if mask[self.index[kind]].any()
         }
+        some = {kind: found for kind, found in some.items() if found.count}
         place = mask.cumsum(0) - 1
         index = {kind: place[self.index[kind][mask[self.index[kind]]]] for kind in some}
         return Evaluations(some, index, int(mask.sum()), self.placed, self.numbers)

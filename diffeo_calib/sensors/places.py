@@ -46,33 +46,45 @@ class SessionPlaces:
 
     Args:
         names: S sessions. transforms: (S, 4, 4) from the model's measuring frame to theirs, m.
+        new: names of the sessions whose frames were found from the rows that are judged.
     """
 
     names: tuple[str, ...]
     transforms: Tensor
+    new: tuple[str, ...] = ()
 
     def aligned(self, data: Measurements) -> Measurements:
-        """Rows of these sessions in the frame of the model; rows that name no session are those of the only one."""
-        names = [name or self.names[0] for name in data.device_names]
-        T = torch.linalg.inv(self.transforms)[[self.names.index(name) for name in names]]
-        return data.in_frames(T.to(data.points.device))
+        """Rows of these sessions in the frame of the model, which is also that of rows that name no session."""
+        here = torch.eye(4, dtype=self.transforms.dtype, device=HOST)[None]
+        T = torch.cat([torch.linalg.inv(self.transforms), here])
+        numbers = {"": self.names.index(ROWS) if ROWS in self.names else len(self.names)}
+        numbers |= {name: number for number, name in enumerate(self.names)}
+        return data.in_frames(T[[numbers[name] for name in data.device_names]].to(data.points.device))
+
+    def beside(self, other: SessionPlaces) -> SessionPlaces:
+        """These, and others of other names."""
+        names, transforms = (*self.names, *other.names), torch.cat([self.transforms, other.transforms])
+        return SessionPlaces(names, transforms, (*self.new, *other.new))
 
     @property
     def fitted_numbers(self) -> int:
-        """How many numbers were found from these rows."""
-        return NUMBERS_OF_A_FRAME * len(self.names)
+        """How many numbers were found from the rows that are judged."""
+        return NUMBERS_OF_A_FRAME * len(self.new)
 
     def entry(self) -> dict[str, object]:
         """Transforms by name, for programs."""
         return dict(zip(self.names, self.transforms.tolist(), strict=True))
 
     def sentences(self) -> list[str]:
-        """What was fitted, and how far every session's frame is from that of the model."""
-        one = len(self.names) == 1
-        whose = "the frame of the one session" if one else f"the frames of {len(self.names)} sessions"
+        """What was fitted, and how far every such session's frame is from that of the model."""
+        if not self.new:
+            return []
+        one = len(self.new) == 1
+        whose = "the frame of the one session" if one else f"the frames of {len(self.new)} sessions"
         lines = [f"{whose} {'was' if one else 'were'} found from these rows, {self.fitted_numbers} numbers in all:"]
         lines[0] += " with few rows the errors look smaller than they are"
-        for name, T in zip(self.names, self.transforms, strict=True):
+        for name in self.new:
+            T = self.transforms[self.names.index(name)]
             turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
             away = f"{1e3 * float(T[:3, 3].norm()):.4g} mm and {1e3 * turn:.4g} mrad away"
             lines.append(f"session '{name}': its frame is {away} from that of the model")

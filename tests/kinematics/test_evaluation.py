@@ -220,7 +220,9 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
     assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
     assert not impossible(arm.model, errors)
     far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
-    assert impossible(arm.model, dc.evaluate(arm.model, far))
+    assert impossible(arm.model, dc.evaluate(arm.model.__call__, far))
+    with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--register"):
+        dc.evaluate(arm.model, far)
 
 
 def test_implausible_orientations_have_a_sentence(posed: Case) -> None:

@@ -216,7 +216,7 @@ def test_a_tool_that_never_turned(arm: Case) -> None:
     assert any("the place of the marker on 'flange' along" in str(one.message) for one in said)
     assert any("turn the tool about several axes" in text for text in record(found).undetermined)
     rest = other_marker(NEW_MARKER, arm.test.q[5:], T, seed=6)
-    assert rms(found, rest) > 1e-3  # wrong elsewhere, as it must be
+    assert dc.evaluate(found.__call__, rest).rms > 1e-3  # wrong elsewhere, as it must be
     assert covered(found, rest) > 0.9
     assert rms(found, other_marker(NEW_MARKER, q, T, seed=7)) < 2e-4  # right where it was measured
 

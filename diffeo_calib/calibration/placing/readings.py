@@ -178,10 +178,11 @@ def identify_readings(
     poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
     for data, T in zip(tables, poses, strict=True):
         kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
-    found = _rough_fits(bare, tables, still, _starts(bare.tool[0], tables, poses))
+    found = _rough_fits(bare, tables, still, _starts(bare.tool[0], tables, poses), poses)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
-        found += _rough_fits(bare, tables, still, [(ball, _around(ball, tables, poses)) for ball in balls])
+        again = [(ball, _around(ball, tables, poses)) for ball in balls]
+        found += _rough_fits(bare, tables, still, again, poses)
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
@@ -189,16 +190,21 @@ def identify_readings(
     rms = _rms(rough.errors)
     start = rows.geometry.absorb(rough.theta)
     registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(rows.count, 1))
-    return _estimate(rows._replace(geometry=start), rough.devices, still if rigid else scale, registration)
+    rows = rows._replace(geometry=start, poses=poses if rigid else None)
+    return _estimate(rows, rough.devices, still if rigid else scale, registration)
 
 
 def _rough_fits(
-    bare: Geometry, tables: Sequence[Readings], scale: Tensor, starts: Sequence[tuple[Tensor, list[Devices]]]
+    bare: Geometry,
+    tables: Sequence[Readings],
+    scale: Tensor,
+    starts: Sequence[tuple[Tensor, list[Devices]]],
+    poses: Sequence[Tensor],
 ) -> list[tuple[tuple[float, str], _Fit, _Rows]]:
     """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
     found = []
     for ball, devices in starts:
-        rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
+        rows = _Rows(bare.with_tool(ball[None]), tuple(tables), poses)
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             rough = _solve(rows, devices, scale, ball.new_full((rows.count,), ROUGH_M), robust=True)
             found.append((_of_worst_device(tables, rough.errors), rough, rows))
@@ -329,32 +335,49 @@ def _rms(errors: Sequence[Tensor]) -> float:
 
 
 class _Rows(NamedTuple):
-    """Readings of several kinds, and the geometry that explains them."""
+    """Readings of several kinds, and the geometry that explains them.
+
+    Args:
+        geometry: with one marker, the ball. tables: readings.
+        poses: (M, 4, 4) of the tip at the rows of every table where errors of joints stay zero, so that only the ball
+            moves; None where they may not.
+    """
 
     geometry: Geometry
     tables: tuple[Readings, ...]
+    poses: Sequence[Tensor] | None = None
 
     @property
     def count(self) -> int:
         return sum(map(len, self.tables))
 
+    def _balls(self, theta: Tensor) -> list[Tensor]:
+        """The ball (M, 3) at the rows of every table, m."""
+        if self.poses is None:
+            return [self.geometry.points(data.q, theta)[:, 0] for data in self.tables]
+        ball = self.geometry.tool[0] + theta[self.geometry.slices["tool"]]
+        return [T[:, :3, :3] @ ball + T[:, :3, 3] for T in self.poses]
+
+    def _by_errors(self, theta: Tensor, free: Tensor) -> list[Tensor]:
+        """Derivatives (M, 3, f) of these by some errors."""
+        if self.poses is None:
+            return [self.geometry.sensitivities(data.q, theta)[:, 0][..., free] for data in self.tables]
+        return [T[:, :3, :3] for T in self.poses]
+
     def errors(self, theta: Tensor, devices: Sequence[Devices]) -> list[Tensor]:
         """Predicted minus measured readings (M, r) of every table, m."""
-        return [
-            -own.errors(data, self.geometry.points(data.q, theta)[:, 0])
-            for data, own in zip(self.tables, devices, strict=True)
-        ]
+        each = zip(self.tables, devices, self._balls(theta), strict=True)
+        return [-own.errors(data, ball) for data, own, ball in each]
 
-    def slopes(self, theta: Tensor, devices: Sequence[Devices], scale: Tensor) -> list[Tensor]:
-        """Derivatives (M, r, K + all increments) of these, in units of the prior deviations."""
+    def slopes(self, theta: Tensor, devices: Sequence[Devices], free: Tensor, scale: Tensor) -> list[Tensor]:
+        """Derivatives (M, r, f + all increments) of these, in units of the prior deviations, by the free errors."""
         sizes = [own.freedom for own in devices]
-        found = []
-        for place, (data, own) in enumerate(zip(self.tables, devices, strict=True)):
-            device, points = own.numbers(data), self.geometry.points(data.q, theta)[:, 0]
-            A = own.observation(device).slope(points)
-            by_theta = A @ (self.geometry.sensitivities(data.q, theta)[:, 0] * scale)
+        found, each = [], zip(self.tables, devices, self._balls(theta), self._by_errors(theta, free), strict=True)
+        for place, (data, own, ball, by_errors) in enumerate(each):
+            device = own.numbers(data)
+            by_theta = own.observation(device).slope(ball) @ (by_errors * scale[free])
             before, after = sum(sizes[:place]), sum(sizes[place + 1 :])
-            shared = torch.nn.functional.pad(own.shared(points, device), (before, after))
+            shared = torch.nn.functional.pad(own.shared(ball, device), (before, after))
             found.append(torch.cat([by_theta, shared], 2))
         return found
 
@@ -375,12 +398,14 @@ class _Fit(NamedTuple):
 
 def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor, *, robust: bool = False) -> _Fit:
     """Fit theta = scale u and the devices' increments, in units of their deviations, by least squares."""
-    K, sizes = len(scale), [own.freedom for own in devices]
+    free, sizes = scale.nonzero()[:, 0], [own.freedom for own in devices]
+    K = len(free)
     weights = [1.0 / own[:, None] for own in sigma.split([len(data) for data in rows.tables])]
 
     def moved(u: Tensor) -> tuple[Tensor, tuple[Devices, ...]]:
         pairs = zip(devices, u[K:].split(sizes), strict=True)
-        return scale * u[:K], tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
+        theta = torch.zeros_like(scale).index_copy(0, free, scale[free] * u[:K])
+        return theta, tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
 
     def errors(u: Tensor) -> Tensor:
         return torch.cat([(w * e).flatten() for w, e in zip(weights, rows.errors(*moved(u)), strict=True)])
@@ -396,7 +421,7 @@ def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor
             return torch.full_like(at_start, torch.nan)
 
     def slopes(u: Tensor) -> Tensor:
-        pairs = zip(weights, rows.slopes(*moved(u), scale), strict=True)
+        pairs = zip(weights, rows.slopes(*moved(u), free, scale), strict=True)
         return torch.cat([(w[..., None] * s).flatten(0, 1) for w, s in pairs])
 
     loss = "soft_l1" if robust else "linear"

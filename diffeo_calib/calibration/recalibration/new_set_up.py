@@ -33,7 +33,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link
+from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, check_shown
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -118,9 +118,10 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
 
     Raises:
         InputError: joints in another order, or markers that the model cannot be compared with.
-        MeasurementError: too few rows, or rows of another size than the robot's.
+        MeasurementError: too few rows, rows that show no error, or of another size than the robot's.
     """
     new = new.to(HOST)
+    check_shown(new)
     _check_robot(model, new)
     own, readings = divided(new)
     check_kinds(model, own, readings)

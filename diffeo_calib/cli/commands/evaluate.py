@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of, refuse_impossible
+from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, refuse_impossible
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import (
@@ -38,6 +38,7 @@ from diffeo_calib.kinematics.evaluation import (
     evaluate,
     place,
     placement_sentences,
+    positions_of,
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
@@ -92,10 +93,10 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         expected = expected_rms(model, seen, errors.errors.shape[1]) if measured and seen is not None else None
         table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=measured)
         for label, some in of_rows.items():
-            table.add(some, f"{len(some.errors)} {label}", expected=expected)
+            table.add(some, f"{some.count} {label}", expected=expected)
         what = "session" if errors is found.positions else "device"
         for device, some in of_devices.items():
-            table.add(some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
+            table.add(some, f"{some.count} of {what} '{plain(device)}'", expected=expected)
         out.print(table)
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
@@ -174,11 +175,11 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     record.add(files={} if output is None else {"model": output})
     record.add(**entries_by_kind({kind: {"after": after} for kind, after in kinds.items()}))
     known = found.registration is not None and found.registration.rms_before is not None
-    before: Any = evaluate(model, data) if known else None
+    before = residuals(model, place(model, data), data) if known else None
     for kind, after in kinds.items():
         table = ErrorTable(after, f"of {plain(name)}", "rows")
-        if known:
-            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} with the places of the fit")
+        if before is not None:
+            table.add(before[kind], f"{after.count} with the places of the fit")
         table.add(after, f"{after.count} with places found anew")
         out.print(table)
     for line in (*registration_lines(found), *placement_sentences(found)):

@@ -12,7 +12,7 @@ C the posterior covariance of the fit, R that of the noise, V = C + R. With a pr
 B is zero, or the covariance of the markers' old places by the fit, a part of C: where the fit hardly knew a marker, as
 along the axis of a tool that was never tilted, the rows place it, though it stayed. Errors of rows left out choose
 between the two. R in place of V in the weights costs 1 % where the model is right. Where the robot has changed since
-its fit, errors are not correlated as C says, and weights by V do harm: on another series of a UR10 more rows made it worse.
+its fit, errors are not correlated as C says, and weights by V do harm: on another series of a UR10 more rows hurt.
 The covariance U, the test for outliers and the marginal likelihood take all of V.
 
 The base may be anywhere. A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one

@@ -167,14 +167,33 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
     A drift is none of them: it belongs to the rows of the old fit.
 
     Args:
-        old, new: the models, of the same points. T: (4, 4) from the frame of the old one to that of the new one, m.
+        old, new: the models, of the same points.
+        T: (4, 4) from the frame of the fit of the old one, before it was registered, to that of the new one, m.
     """
     q, T = old.configurations, T.to(HOST)
+    if old.registration is not None:
+        T = T @ torch.linalg.inv(old.registration.transform.to(HOST))
     before, after, turns = (each.detach().to(HOST) for each in (old(q), new(q), new.turns(q)))
     P = min(before.shape[1], after.shape[1])
     away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
     markers = (turns[:, :P].mT @ away[..., None])[..., 0].mean(0)
     return tuple(own.carried(T, before, after, markers) for own in old.placement if own.kind != DRIFT)
+
+
+def registered_devices(old: Any, new: Any) -> tuple[PlacedDevices, ...]:
+    """The devices of a model beside the same one registered anew; those that saw what it no longer knows are left out.
+
+    Warns:
+        DiffeoCalibWarning: devices that are left out.
+    """
+    same = new.registration.same and old.ball == new.ball
+    lost = [own for own in old.placement if own.devices is not None and not same]
+    if lost:
+        names = few([f"'{name}'" for own in lost for name in own.names])
+        what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
+        warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
+    kept = tuple(own for own in old.placement if own not in lost)
+    return carried_devices(old._with(placement=kept), new, new.registration.transform)
 
 
 def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:
