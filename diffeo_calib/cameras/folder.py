@@ -40,7 +40,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """What the images of a folder show.
+    """Corners found in the images of a folder.
 
     Args:
         name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
@@ -72,7 +72,7 @@ class Folder:
         ]
 
     def camera(self, board: BoardPrior) -> Camera:
-        """What is known of lens and board before a fit: a first guess with wide deviations."""
+        """Prior of lens and board: a first guess with wide deviations."""
         corners = torch.full((len(self.used), len(self.board.points), 5), torch.nan, dtype=torch.float64, device=HOST)
         for row, one in enumerate(self.used):
             whole = np.concatenate([self.board.points[one.numbers], one.pixels], 1)

@@ -1,4 +1,4 @@
-"""What images of a board tell: poses of the board in the camera, with errors that its lens makes in all of them.
+"""Measurements from images of a board: its poses in the camera, with errors that the lens makes in all of them.
 
 Image i shows corners j at pixels u_ij = h(T_i b_j(s), s) + e_ij: T_i is the pose of the board in the camera's frame,
 and s the unknowns of all images: lens and board. With slopes J_i by a shift and turn of T_i and S_i by s, weights W_i,
@@ -151,7 +151,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """What N images of one camera tell.
+    """Measurements from N images of one camera.
 
     Args:
         camera: lens and board.
@@ -205,7 +205,7 @@ def sighted_by_several(
 
 
 def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior) -> list[Camera]:
-    """What is known of all lenses and the one board, with the same columns of errors in all roots.
+    """Knowledge of all lenses and the one board, with the same columns of errors in all roots.
 
     The board's errors are counted once: they are those of the first camera that knows it, the other ones add lenses.
     """

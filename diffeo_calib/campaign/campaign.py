@@ -114,7 +114,7 @@ class Campaign:
 
     @property
     def error_limit(self) -> float | None:
-        """What that error exceeds with 5 % probability, m; None without a goal, and before 20 accepted rows."""
+        """95 % quantile of that error, m; None without a goal, and before 20 accepted rows."""
         limit = inf if self._model is None else self._model.error_limit
         return None if limit == inf else limit
 

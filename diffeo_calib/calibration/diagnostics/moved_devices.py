@@ -148,7 +148,7 @@ class Finding(NamedTuple):
         return chance_of_jump(gain, unknowns, limits.fewest_rows / len(self.columns))
 
     def words(self, limits: ChangeLimits) -> str:
-        """What changed, and by how much."""
+        """Phrase for the change and its size."""
         verb, change = "to drift" if self.drifts else "to have moved", self.point.change
         if self.cause.unit is not None:
             unit, size = self.cause.unit
@@ -158,7 +158,7 @@ class Finding(NamedTuple):
         return f"{name} seems {verb} by about {1e3 * distance:.2g} mm"
 
     def _moved(self, limits: ChangeLimits) -> tuple[str, float]:
-        """What moved, and how far, m."""
+        """Phrase for what moved, and how far, m."""
         motion, basis = self.point.motion, self.cause.basis
         motion = motion if basis is None else (basis @ motion[:, :, None])[:, :, 0]
         size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
@@ -332,7 +332,7 @@ def _normal(columns: Tensor, dense: CholeskyRegression) -> Tensor:
 
 
 def _ridge(H: Tensor) -> Tensor:
-    """What keeps H (..., U, U) invertible where rows do not determine all unknowns."""
+    """Ridge that keeps H (..., U, U) invertible where rows do not determine all unknowns."""
     level = RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
     return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
 
@@ -343,7 +343,7 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
 
 
 def causes_of(data: TangentData) -> list[Cause]:
-    """What may change of robot, tool and measuring frame, and its effects on all rows."""
+    """Possible changes of robot, tool and measuring frame, and their effects on all rows."""
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
     base, markers = _base_motions(points), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
     if data.basis is not None:  # nothing bends a frame

@@ -98,7 +98,7 @@ class Drift(DeviceSet):
 
     @property
     def known(self) -> KnownDrift | None:
-        """What a fit found; None before."""
+        """Drift that a fit found; None before."""
         if self.size_by_column is None or self.deviations is None or self.centre is None:
             return None
         ends = self.lowest, self.highest

@@ -1,4 +1,4 @@
-"""What has changed since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
+"""Changes since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
 
 The residuals r of new rows are N(0, K_0) if only device and markers have moved; if part k has changed, too, they are
 N(0, K_0 + s^2 G_k), with G_k the covariance of that part in the old model and s^2 the variance of the change relative
@@ -297,7 +297,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Changes:
-    """What has changed, the clearest first.
+    """Changes, the clearest first.
 
     Args:
         found: the changes.
