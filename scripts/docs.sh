@@ -2,8 +2,6 @@
 # Build the documentation, in an environment of its own that the first run makes in .venv.
 #
 #   scripts/docs.sh             writes docs_output/ in the project's root; arguments go to `mkdocs build`
-#
-# The search needs a server: python3 -m http.server --directory docs_output
 set -euo pipefail
 EXTRAS="[docs]"
 # shellcheck source=scripts/setup.sh

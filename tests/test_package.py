@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -108,3 +109,14 @@ def test_the_wheel_holds_every_file_of_the_package() -> None:
     packed = {file.distribution_path for file in WheelBuilder(str(root)).recurse_included_files()}
     there = {path.relative_to(root).as_posix() for path in PACKAGE.rglob("*.*") if "__pycache__" not in path.parts}
     assert packed == {name for name in there if (root / name).is_file()}
+
+
+def test_extras_in_messages_and_pages_exist() -> None:
+    root = PACKAGE.parent
+    project = (root / "pyproject.toml").read_text(encoding="utf-8")
+    table = project.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    files = [*PACKAGE.rglob("*.py"), *(root / "scripts/docs/pages").rglob("*.md")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in files)
+    named = set(re.findall(r"pip install \W*(?:diffeo_calib|\.)\[(\w+)\]", text))
+    assert {"camera", "collisions", "fused", "notebooks", "onnx", "ros"} == named
+    assert named <= set(re.findall(r"^(\w+) = ", table, re.MULTILINE))

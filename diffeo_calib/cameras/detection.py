@@ -99,7 +99,9 @@ def opencv() -> Any:
     try:
         import cv2  # noqa: PLC0415
     except ImportError:
-        raise InputError.of("OpenCV is not installed", fix="pip install 'diffeo_calib[camera]'") from None
+        raise InputError.of(
+            "boards are found by OpenCV, which is not installed", fix="pip install 'diffeo_calib[camera]'"
+        ) from None
     return cv2
 
 

@@ -115,7 +115,7 @@ def record_command(
 
     A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
     standard deviations of what was seen (std_x, ...), its time and the number of readings. The clocks of both may
-    differ. Needs the package rosbags.
+    differ. Needs the extra `ros`.
 
     Of images, the one nearest to the middle of each stop is written beside the table, which then has its name and the
     joint values for `images`.

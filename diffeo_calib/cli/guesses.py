@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.cells import number, read_cells
+from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, number, read_cells
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -84,13 +84,19 @@ def guess_sheet(path: Path) -> Sheet:
         for decimal in DECIMALS:
             if decimal == sep:
                 continue
-            columns = [k for k in range(len(header)) if all(number(row[k], decimal) is not None for row in rows)]
+            columns = [k for k in range(len(header)) if all(_readable(row[k], decimal) for row in rows)]
             found.append(Sheet(sep, decimal, tuple(header), tuple(header[k] for k in columns), len(rows)))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
     if best is None or not best.numbers:
         fix = "check that the file has one header line, and the same number of cells in every line"
         raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
     return best
+
+
+def _readable(text: str, decimal: str) -> bool:
+    """Whether `fit` reads the cell: a number, or empty. A date written as one number, 20210313..., is too large."""
+    value = number(text, decimal)
+    return value is not None and not abs(value) >= LARGEST_NUMBER  # NaN: empty
 
 
 def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:

@@ -443,7 +443,8 @@ class Candidates:
         "Upright cylinder in the base frame that no link may enter: place, radius, and top if it ends.", "X,Y,R[,TOP]"
     )
     collisions: bool = option(
-        "Leave out poses in which the robot collides with itself, by its URDF; needs pinocchio.", default=False
+        "Leave out poses in which the robot collides with itself, by its URDF; needs the extra `collisions`.",
+        default=False,
     )
     seed: int = option("Seed of the random candidates.", min=0, max=LARGEST_SEED, default=0)
 

@@ -77,7 +77,7 @@ def data_frame(columns: Mapping[str, Any], index: Any = None) -> Any:
     try:
         import pandas  # noqa: PLC0415  # optional
     except ImportError as error:
-        raise ImportError("data frames need pandas: pip install pandas") from error
+        raise ImportError("data frames need pandas: pip install 'diffeo_calib[notebooks]'") from error
     values = {name: value.cpu().numpy() if hasattr(value, "cpu") else value for name, value in columns.items()}
     return pandas.DataFrame(values, index=index)
 

@@ -13,7 +13,7 @@ try:
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError as error:  # scikit-learn, or one that is too old
     raise ImportError(
-        "diffeo_calib.interop.sklearn needs scikit-learn 1.6 or newer: pip install scikit-learn"
+        "DiffeoRegressor needs scikit-learn 1.6 or newer: pip install 'diffeo_calib[notebooks]'"
     ) from error
 
 from diffeo_calib.calibration.calibrate import Controls, calibrate

@@ -95,8 +95,8 @@ def _messages(bag: Path, wanted: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
         from rosbags.highlevel import AnyReader, AnyReaderError  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
     except ImportError as error:
-        fix = "pip install 'diffeo_calib[camera]'"
-        raise InputError.of("reading bags", expected="the package rosbags", got="none", fix=fix) from error
+        what, fix = "bags are read by the package rosbags, which is not installed", "pip install 'diffeo_calib[ros]'"
+        raise InputError.of(what, fix=fix) from error
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = sorted({one.topic for one in reader.connections})

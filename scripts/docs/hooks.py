@@ -59,6 +59,11 @@ def on_page_content(html: str, **_: Any) -> str:
     return ROLE.sub(lambda found: f"<code>{found[1].rpartition('.')[2] or found[1]}</code>", html)
 
 
+def on_post_page(output: str, **_: Any) -> str:
+    """Name the theme's search dialog, for readers who hear the page."""
+    return output.replace('role="dialog"', 'role="dialog" aria-label="Search"')
+
+
 def examples() -> dict[str, str]:
     """A page of each guide that runs."""
     return {
@@ -81,7 +86,7 @@ def commands() -> str:
         context = Context(command, info_name=name)
         records = [one.get_help_record(context) for one in command.params]
         rows = [f"| `{cleaned(option, code=False)}` | {cleaned(words)} |" for option, words in filter(None, records)]
-        head = [f"## {name}\n", cleaned(command.help), "", "| option | |", "|---|---|"]
+        head = [f"## {name}\n", cleaned(command.help), "", "| option | meaning |", "|---|---|"]
         text.append("\n".join([*head, *rows]))
     return "\n\n".join(text) + "\n"
 

@@ -182,5 +182,5 @@ def test_collisions_need_pinocchio_and_bodies(folding: Chain, robot: Chain, monk
         with pytest.raises(dc.DiffeoCalibError, match="was not read from a URDF"):
             collision_free(sliding_robot())
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(dc.DiffeoCalibError, match="pinocchio, which is not installed; pip install pin"):
+    with pytest.raises(dc.DiffeoCalibError, match=r"not installed; pip install .diffeo_calib\[collisions\]"):
         collision_free(folding)

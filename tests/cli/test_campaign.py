@@ -143,6 +143,7 @@ def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
     assert (written["angle"], written["length"]) == ("deg", "mm")
     assert not {"position", "distance", "distance-std"} & set(written)
     assert "# all columns are used" in text
+    assert "fill in the lines that say `uncomment`, then run" in done.err + done.out
     filled = tomllib.loads(text.replace("# distance", "distance"))
     assert filled["distance"] == ["a,b=50"]
     words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], [*written, *filled])
@@ -228,7 +229,8 @@ def test_the_ur10(tmp_path: Path, command: Command) -> None:
         'std = "measurement_std_x,measurement_std_y,measurement_std_z"',
     ):
         assert line in text
-    assert "Goal x" in text.splitlines()[-1]
+    assert "time = " not in text, "numbers that `fit` refuses"
+    assert "Timestamp, Goal x" in text.splitlines()[-1]
 
 
 def test_a_table_without_numbers_is_refused(tmp_path: Path, command: Command) -> None:
@@ -349,6 +351,10 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
         "time": "time_s",
         "temperature": "Temperature",
     }
+    frame["time_s"] += 20_210_313_000_000  # a date: `fit` refuses it
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "e.toml").code == 0
+    assert "time" not in tomllib.loads((tmp_path / "e.toml").read_text())
 
 
 @pytest.mark.slow

@@ -77,5 +77,5 @@ def test_plans(arm: Case) -> None:
 def test_without_pandas_there_is_one_sentence(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     for call in (arm.test.to_frame, dc.evaluate(arm.model, arm.test).to_frame, lambda: arm.model.to_frame(arm.test.q)):
-        with pytest.raises(ImportError, match="data frames need pandas: pip install pandas"):
+        with pytest.raises(ImportError, match=r"data frames need pandas: pip install .diffeo_calib\[notebooks\]"):
             call()

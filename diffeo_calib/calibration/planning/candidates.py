@@ -377,7 +377,7 @@ def collision_free(
     try:
         import pinocchio as pin  # noqa: PLC0415  # optional
     except ImportError as error:
-        fix = "pip install pin, or pass your own check as `keep`"
+        fix = "pip install 'diffeo_calib[collisions]', or pass your own check as `keep`"
         raise InputError.of("collisions need the package pinocchio, which is not installed", fix=fix) from error
     world = _World(pin, robot, [str(path) for path in packages])
     lower, upper = joint_ranges(robot, _unlimited(robot))

@@ -58,7 +58,8 @@ def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
     write_whole(output, content)
     for line in lines:
         say(line)
-    say(f"campaign: {output}; check it, then run: diffeo-calib fit {output}")
+    fill_in = ", fill in the lines that say `uncomment`" * any("uncomment" in line for line in lines)
+    say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
 
 
 def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:

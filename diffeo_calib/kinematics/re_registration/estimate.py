@@ -331,7 +331,8 @@ def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Esti
         weights: (M,) of the rows; by default those of Student's t, by iteration.
     """
     found, by_fit = _estimate(start, metres, weights), start.session.by_fit
-    if float(by_fit.diagonal().max()) <= metres**2 or not start.session.body_free:
+    known_well = max(metres**2, float(start.session.fitted.new_noise.diagonal().mean()))
+    if float(by_fit.diagonal().max()) <= known_well or not start.session.body_free:
         return found
     held = replace(start.session, by_fit=torch.zeros_like(by_fit))
     return min(found, _estimate(start._replace(session=held), metres, weights), key=lambda each: each.left_out_square)
