@@ -254,9 +254,9 @@ def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
 # --- rows that contradict all others --------------------------------------------------------------------------------
 
 
-def wrong_rows(model: Any, rows: Any) -> tuple[int, ...]:
+def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:
     """Numbers of the rows that a registration leaves out."""
-    found = model.registered(rows.with_line_numbers(torch.arange(len(rows)))).registration
+    found = model.registered(rows.with_line_numbers(torch.arange(len(rows))), **options).registration
     assert found is not None
     return found.outliers
 
@@ -275,4 +275,4 @@ def test_two_rows_that_were_exchanged_are_named() -> None:
     kind = kind_named("camera on the tool")
     q = kind.new.q.clone()
     q[[0, 3]] = q[[3, 0]]
-    assert set(wrong_rows(kind.model, with_attributes(kind.new, q=q))) == {0, 3}
+    assert set(wrong_rows(kind.model, with_attributes(kind.new, q=q), free="base")) == {0, 3}

@@ -12,7 +12,16 @@ from diffeo_calib.measurements.table import Measurements
 
 
 def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
-    """(M, m, m) noise of new rows in the model's frame, m^2: that of usual rows of the fit.
+    """(M, m, m) noise of new rows in the model's frame, m^2: that of usual rows of the fit."""
+    by_row = noise_of_poses(fitted, new)
+    if by_row is not None:
+        return by_row
+    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
+    return block.expand(len(new), -1, -1)
+
+
+def noise_of_poses(fitted: FittedMap, new: Measurements) -> Tensor | None:
+    """(M, m, m) noise of new poses in the model's frame, m^2; None where the fit or the rows have other bodies.
 
     Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
     each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
@@ -20,8 +29,7 @@ def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
     bodies, whole = new.bodies, fitted.slopes is None and bool(fitted.noise.visible.all())
     own, old = bodies.modes(new), bodies.modes_of(new, fitted.measured().unflatten(1, (-1, 3))) if whole else None
     if own is None or old is None:
-        block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
-        return block.expand(len(new), -1, -1)
+        return None
     blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
     to_modes = torch.linalg.pinv(old)
     sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
