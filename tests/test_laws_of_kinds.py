@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -248,3 +249,30 @@ def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
     assert sum("away from that of the model" in line for line in partly.placed) == 1
     assert_close(partly.rows(known).errors, found.rows(known).errors, equal_nan=True)
     assert partly.rows(~known).rms < 1.2 * found.rows(~known).rms
+
+
+# --- rows that contradict all others --------------------------------------------------------------------------------
+
+
+def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:
+    """Numbers of the rows that a registration leaves out."""
+    found = model.registered(rows.with_line_numbers(torch.arange(len(rows))), **options).registration
+    assert found is not None
+    return found.outliers
+
+
+@pytest.mark.parametrize("name", ["camera on the tool", "two cameras"])
+def test_a_row_that_contradicts_all_others_is_named_and_no_other(name: str) -> None:
+    """Rows of cameras differ in their noise, and images share the errors of a lens."""
+    kind = kind_named(name)
+    rows = kind.new.largest_session()
+    moved = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+    moved[4, 0, 3] = 5e-3
+    assert wrong_rows(kind.model, rows.in_frames(moved)) == (4,)
+
+
+def test_two_rows_that_were_exchanged_are_named() -> None:
+    kind = kind_named("camera on the tool")
+    q = kind.new.q.clone()
+    q[[0, 3]] = q[[3, 0]]
+    assert set(wrong_rows(kind.model, with_attributes(kind.new, q=q), free="base")) == {0, 3}

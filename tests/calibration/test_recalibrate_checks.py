@@ -11,9 +11,10 @@ from product_bank import Case, simulated, ur10_measurements
 from test_recalibrate import elsewhere, measured, seen_from, within_region
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.new_rows import NewRows, larger
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.kinematics.re_registration.usual_noise import larger
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 pytestmark = pytest.mark.slow

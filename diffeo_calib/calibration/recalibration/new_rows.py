@@ -27,11 +27,10 @@ from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
@@ -419,48 +418,3 @@ def device_shifts(
     if before.place is None:
         return markers
     return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)
-
-
-def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
-    """(M, m, m) noise of new rows in the model's frame, m^2: that of usual rows of the fit.
-
-    Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
-    each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
-    """
-    bodies, whole = new.bodies, fitted.slopes is None and bool(fitted.noise.visible.all())
-    own, old = bodies.modes(new), bodies.modes_of(new, fitted.measured().unflatten(1, (-1, 3))) if whole else None
-    if own is None or old is None:
-        block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
-        return block.expand(len(new), -1, -1)
-    blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
-    to_modes = torch.linalg.pinv(old)
-    sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
-    eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
-    apart = eye - old @ to_modes
-    slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
-    return block_diagonal((own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye)
-
-
-def typical_noise(noise: Noise) -> Tensor:
-    """The block (m, m) of median size among the rows that show everything: outliers have larger ones.
-
-    If no row does, the blocks of median size of every marker, as if their errors were independent.
-    """
-    whole = noise.visible.all(1)
-    if bool(whole.any()):
-        return _of_median_size(noise.covariance[whole])
-    own = noise.covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).diagonal(dim1=1, dim2=3).movedim(-1, 0)
-    seen = noise.visible[:, ::3].T  # (P, N)
-    return torch.block_diag(*[_of_median_size(blocks[rows]) for blocks, rows in zip(own, seen, strict=True)])
-
-
-def _of_median_size(blocks: Tensor) -> Tensor:
-    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
-    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
-
-
-def larger(first: Tensor, second: Tensor) -> Tensor:
-    """A covariance (M, m, m) that is nowhere smaller than either of two."""
-    values, vectors = torch.linalg.eigh(second - first)
-    total = first + (vectors * values.clamp(min=0.0)[:, None]) @ vectors.mT
-    return 0.5 * (total + total.mT)

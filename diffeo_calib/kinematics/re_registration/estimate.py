@@ -62,6 +62,7 @@ class Session:
         centre: (3,) about which the frame turns, m.
         known: (6 + d, 6 + d) covariance of frame and body from an earlier registration; zero without one.
         by_fit: (6 + d, 6 + d) covariance of the body's old place by the fit, zero elsewhere; C includes it.
+        shared: (M, 3 P, c) effects of errors of unit variance that rows share, m.
         frame_free, body_free: what may have moved.
         ball: whether the last point is a ball that no row shows: it stays where it was on the tool.
     """
@@ -75,13 +76,14 @@ class Session:
     centre: Tensor
     known: Tensor
     by_fit: Tensor
+    shared: Tensor
     frame_free: bool
     body_free: bool
     ball: bool = False
 
     def rows(self, keep: Tensor) -> Session:
         """The session with some of its rows."""
-        own = {"q": self.q[keep], "points": self.points[keep], "noise": self.noise[keep]}
+        own = {name: getattr(self, name)[keep] for name in ("q", "points", "noise", "shared")}
         return replace(self, nominal=self.nominal.rows(keep), **own)
 
     def free_unknowns(self, size: int) -> Tensor:
@@ -112,7 +114,8 @@ class Session:
     def rows_at(self, T: Tensor, view: View, weights: Tensor) -> Rows:
         """Residuals, slopes and covariance of the rows, each of which has a weight (M,)."""
         slopes = torch.cat([frame_slopes(view.places, self.centre), view.slopes], -1)
-        V = view.covariance + torch.block_diag(*self.noise)
+        Z = self.shared.flatten(0, 1)
+        V = view.covariance + torch.block_diag(*self.noise) + Z @ Z.mT
         kept = 1.0 - self.free_unknowns(slopes.shape[2] - 6).to(V)
         S = slopes.flatten(0, 1) * kept
         V = 0.5 * (V + V.mT) + S @ self.known @ S.mT

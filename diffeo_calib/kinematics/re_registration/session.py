@@ -13,6 +13,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, turned
+from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_poses
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.bodies import Body, bodies_of
 from diffeo_calib.measurements.pose_frames import kind_of_points
@@ -60,16 +61,18 @@ def session_of(
     size = 6 + len(old.from_old)
     _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
     zero = data.points.new_zeros(size, size)
-    rows = data.q, data.points, _noise(model.new_noise, data, None), zero[0, :3], zero
+    rows = data.q, data.points, _noise(model, data, data.covariance, known=known), zero[0, :3], zero
     by_fit = zero if not same else _by_fit(fit.with_nominal(nominal.typical), nominal, old, zero)
-    session = Session(fit, nominal, same, *rows, by_fit, free != "marker", free != "base", ball)
+    session = Session(fit, nominal, same, *rows, by_fit, _shared(data), free != "marker", free != "base", ball)
     view = session.view(old)
     T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
     earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
     if before is not None:
         earlier = _earlier(before, old, centre, known=known)
-    noise = _noise(model.new_noise, data, T[:3, :3].mT)
-    return Known(replace(session, noise=noise, centre=centre, known=earlier), old, view, known)
+    seen = data.in_frames(torch.linalg.inv(T).expand(len(data), -1, -1))
+    own = None if data.covariance is None else turned(data.covariance, T[:3, :3].mT)
+    errors = {"noise": _noise(model, seen, own, known=known), "shared": _shared(seen)}
+    return Known(replace(session, **errors, centre=centre, known=earlier), old, view, known)
 
 
 def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
@@ -88,25 +91,31 @@ def _by_fit(fit: FittedMap, nominal: GeometryMap, old: Body, zero: Tensor) -> Te
     return found
 
 
-def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
-    """Covariance of the rows (M, 3 P, 3 P) in the frame of the map: that of the fit; known deviations if larger.
+def _shared(data: Measurements) -> Tensor:
+    """(M, 3 P, c) effects of errors of unit variance that rows share, of lenses and boards, m."""
+    found = [own.slopes for own in data.shared_errors()]
+    return torch.cat(found, 2) if found else data.points.new_zeros(len(data), 3 * data.markers, 0)
 
-    Hidden markers carry no information.
 
-    For another number of markers each has the mean covariance of the fitted ones.
+def _noise(model: FittedMap, data: Measurements, own: Tensor | None, *, known: bool) -> Tensor:
+    """Covariance of rows (M, 3 P, 3 P) in the frame of the fit, m^2; hidden markers carry no information.
+
+    It is that of the fit, or their own where it is larger. Poses of the fit turn and stand as each row has them. For
+    another number of markers each has the mean covariance of the fitted ones.
 
     Args:
-        new_noise: that of the fit. data: rows, with known deviations perhaps. R: (3, 3) turns these into the frame.
+        model: as it stands now. data: rows in the frame of the fit. own: (M, 3 P, 3 P) what is known of them, m^2.
+        known: whether they may show the bodies of the fit.
     """
-    size = 3 * data.markers
+    new_noise, size, fit = model.new_noise, 3 * data.markers, model.unregistered
     if len(new_noise) != size:
         blocks = new_noise.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2)  # (3, 3, P)
         new_noise = torch.block_diag(*[blocks.mean(-1)] * data.markers)
-    known, visible = data.covariance, data.visible.repeat_interleave(3, 1)
-    total = new_noise.expand(len(data), size, size)
-    if known is not None and float(known.diagonal(dim1=1, dim2=2)[visible].mean()) > float(new_noise.diagonal().mean()):
-        total = total + (known if R is None else turned(known, R))
-    return total if bool(visible.all()) else without_hidden(total, visible)
+    by_row = noise_of_poses(fit, data) if known else None
+    inflation = model.new_noise.trace() / fit.new_noise.trace()
+    total = new_noise.expand(len(data), size, size) if by_row is None else inflation * by_row
+    total = total if own is None else larger(total, own)
+    return without_hidden(total, data.visible.repeat_interleave(3, 1))
 
 
 def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) -> Tensor:
