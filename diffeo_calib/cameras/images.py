@@ -37,7 +37,7 @@ from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transform
 
 UNKNOWNS = (*LENS, *BOARD)
 FEWEST_CORNERS = 6
-OUTLIER = 3.5
+OUTLIER_DEVIATIONS = 3.5
 """Errors of corners, in standard deviations of their image, from which they lose their weight."""
 ROUNDS, STEPS = 6, 30
 CONVERGED, DAMPED = 1e-10, 1e10
@@ -405,13 +405,13 @@ def _weights(state: State, noise: Tensor | None = None) -> Tensor:
     seen, size = state.images.seen, state.errors().norm(dim=-1).nan_to_num(0.0)
     if noise is None:
         usual = (size.where(seen, size.new_tensor(torch.nan)).nanmedian(1).values / 1.1774).clamp(min=SMALLEST_NOISE_PX)
-        inlier = seen & (size < OUTLIER * usual[:, None])
+        inlier = seen & (size < OUTLIER_DEVIATIONS * usual[:, None])
         squares, numbers = (size**2 * inlier).sum(1), 2.0 * inlier.sum(1)
         spare = (numbers - 6).clamp(min=1.0)
         level = (squares / spare).median()  # a usual image: few blurred ones do not count for all
         noise = ((squares + 2 * PRIOR_IMAGE_CORNERS * level) / (spare + 2 * PRIOR_IMAGE_CORNERS)).sqrt()[:, None]
     noise = noise.clamp(min=SMALLEST_NOISE_PX)
-    return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
+    return torch.where(seen, (OUTLIER_DEVIATIONS * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
 
 
 def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:

@@ -26,7 +26,7 @@ SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
 ROUNDS = 20
 """Steps of a refinement."""
-TAIL = 3.0
+OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
@@ -265,7 +265,7 @@ class Devices(ABC):
             errors, slopes = devices.errors(data, points), devices.shared(points, devices.numbers(data))
             size = errors.norm(dim=1, keepdim=True)
             level = size.median().clamp(min=SMALLEST_MEDIAN_M)
-            weight = (1 / (1 + (size / (TAIL * level)) ** 2).sqrt() / level)[..., None]
+            weight = (1 / (1 + (size / (OUTLIER_MEDIANS * level)) ** 2).sqrt() / level)[..., None]
             eye = torch.eye(slopes.shape[2], dtype=slopes.dtype, device=slopes.device)
             matrix = torch.cat([(weight * slopes).flatten(0, 1), eye])
             target = torch.cat([(weight[..., 0] * errors).flatten(), eye[0] * 0.0])

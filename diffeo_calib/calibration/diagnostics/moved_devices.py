@@ -35,7 +35,7 @@ from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.se3 import skew
 
-RIDGE = 1e-9
+RELATIVE_RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""
 
 
@@ -333,7 +333,7 @@ def _normal(columns: Tensor, dense: CholeskyRegression) -> Tensor:
 
 def _ridge(H: Tensor) -> Tensor:
     """Ridge that keeps H (..., U, U) invertible where rows do not determine all unknowns."""
-    level = RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
+    level = RELATIVE_RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
     return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
 
 
@@ -383,7 +383,7 @@ def find_change_point(
     blocks = torch.einsum("iujk,jkv->ijuv", half, effects)[order][:, order]
     H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
     g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
-    H = H + RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
+    H = H + RELATIVE_RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
     u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]  # noise-free rows may leave H singular
     gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
     count = int(gains.argmax()) + fewest_rows  # rows after the change point
