@@ -60,7 +60,7 @@ MOST_ROWS = 300
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """What a model expects of the errors of its positions, without the noise of a measurement.
+    """Errors of positions that a model expects, without the noise of a measurement.
 
     All are root mean square distances, m, of the ball if the model has one, else of all markers, or of the origins of
     measured poses; without a measuring device after the best rigid motion.
@@ -297,7 +297,7 @@ def _registered_places(fitted: Any) -> tuple[Tensor, Tensor, Tensor]:
 STILL_RANGE = 0.05
 """Range of a joint, rad or m, below which the rows do not show its errors."""
 SAG_DEVIATION = 5e-4
-"""What is known of the sag of any robot's joints, rad or m: 100 N m on a gear of 2e5 N m/rad."""
+"""Prior scale of the sag of any robot's joints, rad or m: 100 N m on a gear of 2e5 N m/rad."""
 SHOWN_SHARE = 0.5
 """Share of the variance of its features in any poses, from which the rows show the sag of a joint."""
 SMALLEST_SPREAD = 0.1

@@ -57,7 +57,7 @@ class Outlier:
 
     @property
     def shown(self) -> tuple[float, str]:
-        """What it is off by, and the unit."""
+        """Size of the error, and its unit."""
         return self.reading or (1e3 * self.distance, "mm")
 
 

@@ -110,7 +110,7 @@ class CalibrationResult:
 
     @cached_property
     def expected(self) -> ExpectedError:
-        """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
+        """Errors that the model expects of itself over the joint ranges of the rows; larger with a doubtful length."""
         return ExpectedError.of(self.model)
 
     def aligned(self, data: Any) -> Any:

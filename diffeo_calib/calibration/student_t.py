@@ -40,7 +40,7 @@ class FreedomPrior:
 
 
 FREEDOM_PRIOR = FreedomPrior()
-GRID = 400
+FREEDOM_GRID_POINTS = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
 BLOCK = 1 << 16
 """Numbers of the likelihood that are added at once."""
@@ -109,7 +109,7 @@ def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
     D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
     """
     low, high = log(prior.smallest), log(1.01 * prior.gaussian)
-    grid = torch.logspace(low, high, GRID, base=torch.e, dtype=squares.dtype, device=squares.device)
+    grid = torch.logspace(low, high, FREEDOM_GRID_POINTS, base=torch.e, dtype=squares.dtype, device=squares.device)
     value = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
     of_dim = {dim: squares} if isinstance(dim, int) else {int(k): squares[dim == k] for k in dim.unique()}
     for k, own in of_dim.items():

@@ -99,7 +99,7 @@ def _distorted(points: Tensor, lens: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What images of a board showed, for others of the same camera.
+    """Range of views in images of a board, for planning more with the same camera.
 
     Args:
         points: (K, 3) corners of the board as it was meant, m. fewest: corners in an image.

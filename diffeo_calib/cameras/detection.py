@@ -23,7 +23,7 @@ FEWEST_CORNERS = 8
 BLURRED_PX, MOVED_RATIO = 5.0, 1.6
 """Median width of edges at corners, pixels, from which an image is blurred, and how much wider than edges in another
 direction, from which something moved. A lens that blurs by a standard deviation of 0.7 px makes widths of 2."""
-PATCH = 8
+HALF_PATCH_PX = 8
 """Half of the side of the patch around a corner in which edges are measured, pixels."""
 
 REFINED_PX = 5
@@ -121,8 +121,11 @@ def edge_widths(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     steps = np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]])
     found = []
     for column, row in np.rint(pixels).astype(int):
-        patch = grey[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1].astype(float)
-        if min(patch.shape) > PATCH:
+        patch = grey[
+            max(row - HALF_PATCH_PX, 0) : row + HALF_PATCH_PX + 1,
+            max(column - HALF_PATCH_PX, 0) : column + HALF_PATCH_PX + 1,
+        ].astype(float)
+        if min(patch.shape) > HALF_PATCH_PX:
             down, right = np.gradient(patch)
             slopes = np.abs(right[..., None] * steps[:, 0] + down[..., None] * steps[:, 1]).max((0, 1))
             found.append(np.ptp(patch) / np.maximum(slopes, 1e-9))

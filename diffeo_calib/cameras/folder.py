@@ -21,7 +21,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few
 
 IMAGE, CAMERA = "image", "camera"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-THUMBNAIL = 320
+THUMBNAIL_WIDTH_PX = 320
 """Width of an image in the overview, pixels."""
 Progress = Callable[[str, int, int], None]
 
@@ -40,7 +40,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """What the images of a folder show.
+    """Corners found in the images of a folder.
 
     Args:
         name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
@@ -72,7 +72,7 @@ class Folder:
         ]
 
     def camera(self, board: BoardPrior) -> Camera:
-        """What is known of lens and board before a fit: a first guess with wide deviations."""
+        """Prior of lens and board: a first guess with wide deviations."""
         corners = torch.full((len(self.used), len(self.board.points), 5), torch.nan, dtype=torch.float64, device=HOST)
         for row, one in enumerate(self.used):
             whole = np.concatenate([self.board.points[one.numbers], one.pixels], 1)
@@ -209,7 +209,7 @@ def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, us
 def _thumbnail(grey: np.ndarray, pixels: np.ndarray) -> str:
     """A small JPEG in base64 with the corners drawn."""
     cv2 = opencv()
-    share = THUMBNAIL / grey.shape[1]
+    share = THUMBNAIL_WIDTH_PX / grey.shape[1]
     small = cv2.cvtColor(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
     for column, row in (share * pixels).tolist():
         cv2.circle(small, (round(column), round(row)), 3, (0, 0, 255), 1, cv2.LINE_AA)

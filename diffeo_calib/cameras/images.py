@@ -1,4 +1,4 @@
-"""What images of a board tell: poses of the board in the camera, with errors that its lens makes in all of them.
+"""Measurements from images of a board: its poses in the camera, with errors that the lens makes in all of them.
 
 Image i shows corners j at pixels u_ij = h(T_i b_j(s), s) + e_ij: T_i is the pose of the board in the camera's frame,
 and s the unknowns of all images: lens and board. With slopes J_i by a shift and turn of T_i and S_i by s, weights W_i,
@@ -37,7 +37,7 @@ from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transform
 
 UNKNOWNS = (*LENS, *BOARD)
 FEWEST_CORNERS = 6
-OUTLIER = 3.5
+OUTLIER_DEVIATIONS = 3.5
 """Errors of corners, in standard deviations of their image, from which they lose their weight."""
 ROUNDS, STEPS = 6, 30
 CONVERGED, DAMPED = 1e-10, 1e10
@@ -151,7 +151,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """What N images of one camera tell.
+    """Measurements from N images of one camera.
 
     Args:
         camera: lens and board.
@@ -205,7 +205,7 @@ def sighted_by_several(
 
 
 def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior) -> list[Camera]:
-    """What is known of all lenses and the one board, with the same columns of errors in all roots.
+    """Knowledge of all lenses and the one board, with the same columns of errors in all roots.
 
     The board's errors are counted once: they are those of the first camera that knows it, the other ones add lenses.
     """
@@ -405,13 +405,13 @@ def _weights(state: State, noise: Tensor | None = None) -> Tensor:
     seen, size = state.images.seen, state.errors().norm(dim=-1).nan_to_num(0.0)
     if noise is None:
         usual = (size.where(seen, size.new_tensor(torch.nan)).nanmedian(1).values / 1.1774).clamp(min=SMALLEST_NOISE_PX)
-        inlier = seen & (size < OUTLIER * usual[:, None])
+        inlier = seen & (size < OUTLIER_DEVIATIONS * usual[:, None])
         squares, numbers = (size**2 * inlier).sum(1), 2.0 * inlier.sum(1)
         spare = (numbers - 6).clamp(min=1.0)
         level = (squares / spare).median()  # a usual image: few blurred ones do not count for all
         noise = ((squares + 2 * PRIOR_IMAGE_CORNERS * level) / (spare + 2 * PRIOR_IMAGE_CORNERS)).sqrt()[:, None]
     noise = noise.clamp(min=SMALLEST_NOISE_PX)
-    return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
+    return torch.where(seen, (OUTLIER_DEVIATIONS * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
 
 
 def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:

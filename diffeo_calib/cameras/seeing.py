@@ -41,7 +41,7 @@ def shown(camera: Camera, poses: Tensor) -> Tensor:
 
 
 def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """What images of boards at poses (N, 4, 4), m, that a camera with images sees, would tell.
+    """Measurements expected from images of boards at poses (N, 4, 4), m, by a camera that has taken images before.
 
     Returns:
         covariance (N, 6, 6) of shift (m) and turn (rad) of the boards in the camera's axes, and effects (N, 6, 14) of

@@ -32,7 +32,7 @@ from diffeo_calib.robots.tree import Tree
 
 FIRST_ROWS = 12
 """Accepted rows of the first model."""
-GROWTH = 1.5
+ROWS_GROWTH_PER_MODEL = 1.5
 """Factor by which the accepted rows grow between two models."""
 FIRST_SCALES, SCALES_GROWTH = 20, 2.0
 """Accepted rows at which scales are selected first; factor by which these grow until they are selected again."""
@@ -114,7 +114,7 @@ class Campaign:
 
     @property
     def error_limit(self) -> float | None:
-        """What that error exceeds with 5 % probability, m; None without a goal, and before 20 accepted rows."""
+        """95 % quantile of that error, m; None without a goal, and before 20 accepted rows."""
         limit = inf if self._model is None else self._model.error_limit
         return None if limit == inf else limit
 
@@ -239,7 +239,7 @@ class Campaign:
     def _renew(self) -> None:
         """Make a new model if it is due."""
         count, model = len(self.accepted), self._model
-        due = FIRST_ROWS if model is None else min(GROWTH * model.count, self._next_scales(model))
+        due = FIRST_ROWS if model is None else min(ROWS_GROWTH_PER_MODEL * model.count, self._next_scales(model))
         if count < due or count == self._tried or self._maker is not None:
             return
         self._tried = count

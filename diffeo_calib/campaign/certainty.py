@@ -26,11 +26,11 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.posterior import Rows
 from diffeo_calib.common.quantiles import chi2_above
 
-EXCEEDED = 0.05
+EXCEEDANCE_PROBABILITY = 0.05
 """Probability that the true error is above the limit."""
-COORDINATES = 450
+MOST_COORDINATES = 450
 """Measured numbers of random rows that stand for all."""
-STEP = 0.2
+LOG_SCALE_STEP = 0.2
 """Of a log scale, between which derivatives are taken."""
 
 
@@ -43,7 +43,7 @@ def scales_deviation(
         data: the rows that they were selected with. target: the places at other scales.
         compared: (T r, T 3 P) what of the errors there counts.
     """
-    _, some = data.sample(len(data.x), COORDINATES, 0)
+    _, some = data.sample(len(data.x), MOST_COORDINATES, 0)
     point = scales.logarithms()
 
     def at(logarithms: Tensor) -> tuple[Tensor, float]:
@@ -57,11 +57,11 @@ def scales_deviation(
 
     low = torch.linalg.cholesky(at(point)[0])
     white, slopes = [], []
-    for step in STEP * torch.eye(len(point), dtype=point.dtype, device=point.device):
+    for step in LOG_SCALE_STEP * torch.eye(len(point), dtype=point.dtype, device=point.device):
         (K, value), (K_before, value_before) = at(point + step), at(point - step)
-        half = torch.linalg.solve_triangular(low, (K - K_before) / (2 * STEP), upper=False)
+        half = torch.linalg.solve_triangular(low, (K - K_before) / (2 * LOG_SCALE_STEP), upper=False)
         white.append(torch.linalg.solve_triangular(low, half.T, upper=False).flatten())
-        slopes.append((value - value_before) / (2 * STEP))
+        slopes.append((value - value_before) / (2 * LOG_SCALE_STEP))
     W, g = torch.stack(white), torch.tensor(slopes, dtype=point.dtype, device=point.device)
     F = 0.5 * W @ W.T + torch.eye(len(g), dtype=W.dtype, device=W.device) / SCALE_PRIOR.growth**2
     return float(g @ torch.linalg.solve(F, g)) ** 0.5
@@ -76,4 +76,4 @@ def limit_of(error: float, covariance: Tensor, scales_deviation: float) -> float
     if isinf(scales_deviation):
         return inf
     freedom = 1.0 / (float(covariance.square().sum() / covariance.trace() ** 2) + 2.0 * scales_deviation**2)
-    return error * (chi2_above(EXCEEDED, freedom) / freedom) ** 0.5
+    return error * (chi2_above(EXCEEDANCE_PROBABILITY, freedom) / freedom) ** 0.5

@@ -45,7 +45,7 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError
 MOST_BYTES = 1 << 20
 """Of a line."""
 DECISIONS = ("accept", "reject", "repeat")
-"""What a user may do with a row: methods of a campaign."""
+"""Decisions of a user on a row: methods of a campaign."""
 LOCAL = ("127.0.0.1", "localhost")
 CLOSING_SECONDS = 2.0
 """For the last answers of a campaign."""

@@ -187,5 +187,5 @@ class GrowingTable:
 
 
 def digest(line: bytes) -> str:
-    """What tells a line of a table from others."""
+    """Hash that tells a line of a table from others."""
     return hashlib.sha256(line.strip()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""What a campaign knows at one time: places, scales and the posterior of its accepted rows, and the last rows."""
+"""State of knowledge of a campaign: places, scales and the posterior of its accepted rows, and the last rows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Around(NamedTuple):
     index: Tensor
 
     def causes(self) -> list[Cause]:
-        """What may change of robot, tool and devices."""
+        """Changes of robot, tool and devices that are tested."""
         devices = [one._replace(effects=one.effects[self.index]) for one in self.devices()]
         return [one for one in (*causes_of(self.data), *devices) if bool((one.effects != 0).any())]
 
@@ -165,7 +165,7 @@ class CampaignModel:
 
     @property
     def error_limit(self) -> float:
-        """What the error over the target exceeds with 5 % probability, m; infinite where that is not known."""
+        """95 % quantile of the error over the target, m; infinite where it is not known."""
         return limit_of(self.expected_error, self._covariance, self.deviation)
 
     @property
@@ -241,7 +241,7 @@ class CampaignModel:
     def _change(
         self, around: Around, seen: Seen, verdicts: Sequence[Verdict], single: Measure, typical: float
     ) -> Change | None:
-        """What changed among the last rows."""
+        """Change found among the last rows."""
         own = [verdicts[number] for number in self.window]
         known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
         return find_change(seen, self.window, around.causes(), (known, doubted), single=single, typical=typical)

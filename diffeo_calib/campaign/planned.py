@@ -22,7 +22,7 @@ MOST_ROWS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Next:
-    """What to measure next.
+    """Poses to measure next.
 
     Args:
         q: (count, n) rad or m: poses to measure again, then the most helpful first.

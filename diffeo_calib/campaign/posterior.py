@@ -1,4 +1,4 @@
-"""What accepted rows say about other rows, kept up to date one row at a time.
+"""Predictions of rows from the accepted ones, kept up to date one row at a time.
 
 With y = G c + noise the tangent model of rows (calibration/scales/tangent_data.py) and L L^T = K + R of the accepted
 ones, a row with covariances C = K(accepted, row) is known through V = L^-1 C:

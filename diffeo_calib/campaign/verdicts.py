@@ -86,7 +86,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a campaign thinks of a row.
+    """Verdict of a campaign on a row.
 
     Args:
         row: its number in the campaign, from 0.
@@ -185,7 +185,7 @@ def find_change(
     typical: float,
     limits: JudgementLimits = LIMITS,
 ) -> Change | None:
-    """What changed among rows in order, the last one included; None if chance explains everything.
+    """Change found among rows in order, the last one included; None if chance explains everything.
 
     Args:
         seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, m, U) on them, m.

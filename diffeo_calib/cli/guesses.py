@@ -14,7 +14,7 @@ from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
-ROWS = 50
+ROWS_LOOKED_AT = 50
 """Rows that are looked at."""
 NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
 """Parts of the names of columns that hold deviations or wishes, not measured places."""
@@ -80,7 +80,7 @@ def guess_sheet(path: Path) -> Sheet:
             header, lines = read_cells(path, sep)
         except MeasurementError:
             continue
-        rows = [cells for _, cells in lines[:ROWS]]
+        rows = [cells for _, cells in lines[:ROWS_LOOKED_AT]]
         for decimal in DECIMALS:
             if decimal == sep:
                 continue

@@ -27,7 +27,7 @@ ID = "id"
 
 @dataclass(frozen=True)
 class Shown:
-    """What a campaign says, and how.
+    """How a campaign prints.
 
     Args:
         poses: number of the next poses. lines: whether everything is said as JSON lines.

@@ -30,11 +30,11 @@ from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 
-PARALLEL = 0.05
+PARALLEL_SINE = 0.05
 """Sine of the angle between two axes below which they are treated as nearly parallel (3 degrees)."""
-COINCIDENT = 1e-14
+COINCIDENT_AXES_M = 1e-14
 """Distance, m, below which two parallel axes are one."""
-SHORT = 0.01
+SHORT_PROJECTION = 0.01
 """Length of a projected direction, per length, below which another one is projected."""
 
 
@@ -188,7 +188,7 @@ def links(
         rows.append(_link(at, *line))
         at = at @ row_transform(rows[-1])
         after.append(at)
-    if float(torch.linalg.cross(at[:3, 2], tip[:3, 2]).norm()) > PARALLEL:
+    if float(torch.linalg.cross(at[:3, 2], tip[:3, 2]).norm()) > PARALLEL_SINE:
         last = _link(at, tip[:3, 2], tip[:3, 3])
     else:  # the tool takes the rest
         last = DHRow(0.0, 0.0, float(at[:3, 2] @ (tip[:3, 3] - at[:3, 3])))
@@ -201,14 +201,14 @@ def _link(at: Tensor, direction: Tensor, point: Tensor) -> DHRow:
     u, v, w = (R.mT @ direction).tolist()
     x, y, z = (R.mT @ (point - at[:3, 3])).tolist()
     sine = hypot(u, v)
-    if sine > PARALLEL:
+    if sine > PARALLEL_SINE:
         theta = _forward(-v, u)  # along the common normal
         rotated = _turned(u, v, -theta), _turned(x, y, -theta)
         (_, v), (a, y) = rotated
         alpha = atan2(-v, w)
         return DHRow(a, alpha, z - y * w / v, theta)
     foot_x, foot_y = x - z / w * u, y - z / w * v  # the next axis in the plane z = 0
-    theta = _forward(foot_x, foot_y) if hypot(foot_x, foot_y) > COINCIDENT else 0.0
+    theta = _forward(foot_x, foot_y) if hypot(foot_x, foot_y) > COINCIDENT_AXES_M else 0.0
     (a, _), (u, v) = _turned(foot_x, foot_y, -theta), _turned(u, v, -theta)
     return DHRow(a, atan2(-v, w), 0.0, theta, beta=atan2(u, hypot(v, w)))
 
@@ -217,7 +217,7 @@ def on_axis(start: Tensor, direction: Tensor, point: Tensor) -> Tensor:
     """The frame on an axis, its z axis, that is next to another frame."""
     origin = point + direction * (direction @ (start[:3, 3] - point))
     x, y = (a - direction * (direction @ a) for a in (start[:3, 0], start[:3, 1]))
-    x = x if float(x.norm()) > SHORT else torch.linalg.cross(y, direction)
+    x = x if float(x.norm()) > SHORT_PROJECTION else torch.linalg.cross(y, direction)
     frame = torch.eye(4, dtype=torch.float64, device=HOST)
     x = x / x.norm()
     frame[:3] = torch.stack([x, torch.linalg.cross(direction, x), direction, origin], dim=1)

@@ -47,7 +47,7 @@ LARGEST_PARAMETER = 1e6
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
 """Entries that a header may have or not."""
-PROBES = 8
+PROBE_CONFIGURATIONS = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
 MAP_TENSORS = {
@@ -125,7 +125,7 @@ def _of_robot(model: CalibratedKinematics) -> Header:
 
 def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if isinstance(nominal, SmoothMap):
-        return {"kind": "function"}, {"probe": nominal.function(x[:PROBES])}
+        return {"kind": "function"}, {"probe": nominal.function(x[:PROBE_CONFIGURATIONS])}
     if not isinstance(nominal, GeometryMap):
         raise InputError.of(
             "the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__
@@ -268,7 +268,7 @@ def _rebuild_nominal(
             raise MissingArgumentError.of(
                 "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
             )
-        value = nominal(tensors["x"][:PROBES])
+        value = nominal(tensors["x"][:PROBE_CONFIGURATIONS])
         if value.shape != tensors["probe"].shape or not torch.allclose(value, tensors["probe"], rtol=1e-9, atol=1e-12):
             raise MissingArgumentError.of(
                 "`nominal` is not the map that the model was fitted to", fix="pass the same function"

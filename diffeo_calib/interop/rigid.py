@@ -43,7 +43,7 @@ PLACE_STD = 1e-2
 """Prior standard deviation of base and markers around the model's own, m or rad."""
 FIXED_STD = 1e-9
 """Prior standard deviation of joint errors that are to stay, m or rad."""
-LARGER = 1.01
+TOLERATED_RMS_RATIO = 1.01
 """Relative increase of the RMS distance at which base and markers close to the model's are no good fit."""
 
 
@@ -188,7 +188,7 @@ def _placed(model: CalibratedKinematics, joint_errors: Tensor, x: Tensor, y: Ten
     noise = max(best.rms / sqrt(3), LIMITS.smallest_noise_m)
     prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
     near = identify(start, x, y, noise=noise, prior=prior)
-    found = near if near.rms < LARGER * best.rms + LIMITS.smallest_noise_m else best
+    found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + LIMITS.smallest_noise_m else best
     return replace(found.geometry, joint_errors=start.joint_errors)
 
 

@@ -23,7 +23,7 @@ from diffeo_calib.runtime.tables import JointTables
 
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
-APART = 8.0
+CIRCLE_SPACING_RAD = 8.0
 """Distance between the circles of two joints on the line where cells are searched; more than 2 pi."""
 
 
@@ -90,13 +90,15 @@ class TransmissionTables(nn.Module):
         super().__init__()
         self.joints = list(tables.joints)
         self.stages, self.halvings = len(tables.stages), []
-        self.register_buffer("shifts", APART * torch.arange(len(self.joints), dtype=torch.float64, device=HOST))
+        self.register_buffer(
+            "shifts", CIRCLE_SPACING_RAD * torch.arange(len(self.joints), dtype=torch.float64, device=HOST)
+        )
         self.register_buffer("selection", torch.eye(size, dtype=torch.float64, device=HOST)[self.joints])
         for stage, row in enumerate(tables.stages):
             counts = [len(table.knots) - 1 for table in row]
-            starts = [table.knots[:-1] + APART * k for k, table in enumerate(row)]
+            starts = [table.knots[:-1] + CIRCLE_SPACING_RAD * k for k, table in enumerate(row)]
             self.halvings.append(int(max(counts)).bit_length())
-            padding = np.full(2 << self.halvings[-1], APART * (len(row) + 1))  # beyond every angle
+            padding = np.full(2 << self.halvings[-1], CIRCLE_SPACING_RAD * (len(row) + 1))  # beyond every angle
             cells = np.concatenate([np.concatenate(starts)[None], np.concatenate([t.coefficients for t in row], 1)])
             self.register_buffer(f"starts{stage}", constant(np.concatenate([*starts, padding])))
             self.register_buffer(f"cells{stage}", constant(cells.T))  # (K, 7): start, coefficients

@@ -31,7 +31,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
 
-SAME = 1e-9
+SAME_ROBOT_TOLERANCE = 1e-9
 """Largest difference, m or rad, between two descriptions of one robot."""
 READ_BACK = 1e-12
 """Largest difference, per metre of reach, between poses by the written file and by the geometry."""
@@ -211,7 +211,7 @@ def _check_same(chain: Tree, other: Tree, path: Path) -> None:
         *zip(names, chain.coupling_offset, other.coupling_offset, strict=True),
     ]
     for joint, mine, theirs in numbers:
-        if float((mine - theirs).abs().max()) > SAME:
+        if float((mine - theirs).abs().max()) > SAME_ROBOT_TOLERANCE:
             what = f"'{path}' is not the URDF that the model was fitted with: it differs at '{joint}'"
             raise RobotError.of(what, fix="pass the nominal URDF of the fit")
 

@@ -26,7 +26,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.places import NUMBERS_OF_A_FRAME, SESSION
 
-RIGID = 0.01
+RIGID_MOTION_SHARE = 0.01
 """Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""
 
 
@@ -174,7 +174,7 @@ class SessionFrame(NamedTuple):
         slopes = frame_slopes(points[rows], points.new_zeros(3)).flatten(0, 1)
         twists = torch.linalg.lstsq(slopes, effects, driver="gelsd").solution
         left = (effects - slopes @ twists).norm(dim=0)
-        rigid = left < RIGID * effects.norm(dim=0)
+        rigid = left < RIGID_MOTION_SHARE * effects.norm(dim=0)
         columns[columns.clone()] = rigid
         if int(rigid.sum()) != NUMBERS_OF_A_FRAME:
             what = f"the hand-eye transform of '{name}'"

@@ -1,4 +1,4 @@
-"""What is seen of the tool, markers or frames that three points each represent: the only place that knows both.
+"""Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both.
 
 A body has an origin, the marker itself or that of its frame, and numbers that tell where it is: three coordinates, of
 frames a rotation vector too. In a registration it is an unknown around its old place.
@@ -64,14 +64,14 @@ class Bodies:
     points, numbers = 1, 3
     """Points of one of them, and numbers that tell where it is."""
     kind, one, many, maker = "points", "marker", "markers", "Measurements"
-    """What messages call them; what makes a table of them."""
+    """Their name in messages; the function that makes a table of them."""
 
     def tips(self, on: Sequence[str]) -> Sequence[str]:
         """The tip of each body, of those of all points."""
         return on[:: self.points]
 
     def predicted(self, model: Any, q: Any, *, noise: bool = True) -> Predicted:
-        """What a calibrated model expects at configurations (N, n), by default of new measurements."""
+        """Prediction of a calibrated model at configurations (N, n), by default of new measurements."""
         mean, covariance = model.predict(q, noise=noise)
         return Predicted(mean, mean, covariance, POSE_NAMES[:3])
 
@@ -169,11 +169,11 @@ class Bodies:
             yield f"marker {number} in the frame of {printable(tip)} [m]: {place}"
 
     def moved_words(self, points: int) -> str:
-        """What messages call this number of points of the tool that may have moved."""
+        """Name in messages for this number of points of the tool that may have moved."""
         return "the marker" if points == 1 else "the markers"
 
     def name(self, number: int, count: int) -> str:
-        """What one of several bodies is called."""
+        """Name of one of several bodies."""
         return f"marker {number}" if count > 1 else "marker"
 
 

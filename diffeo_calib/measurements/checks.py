@@ -37,7 +37,7 @@ ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / ma
 
 
 def angle_mistake(words: str) -> str:
-    """What a wrong unit of joint values is called."""
+    """Sentence about a wrong unit of joint values."""
     return f"the joint values seem to be {words}; check the angle unit"
 
 

@@ -27,7 +27,7 @@ FEWEST_IMAGES = 8
 
 
 Known = tuple[int, int] | Camera
-"""What is known of a camera before: width and height of its images, pixels, or lens and board too."""
+"""Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
 ONLY_CAMERA = "camera"
 """Name of a camera that is alone."""
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
@@ -36,7 +36,7 @@ NO_IMAGES = dict.fromkeys(IMAGE_COLUMNS) | {"cameras": {}}
 
 
 class ImageTable(RowTable):
-    """What tables of images hold beside poses.
+    """Columns of tables of images beside poses.
 
     Attributes:
         corners: (N, K, 5), see :meth:`from_images`; None without images. cameras: lens and board that they show, by the
@@ -179,7 +179,7 @@ class SharedErrors(NamedTuple):
 
 
 def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
-    """What is known of each camera; MeasurementError for one of which nothing is, or one camera for several."""
+    """Prior knowledge of each camera; MeasurementError for one of which nothing is, or one camera for several."""
     fix = "pass a mapping from the name of each camera to what is known of it"
     if isinstance(camera, Mapping):
         missing = [name for name in names if name not in camera]

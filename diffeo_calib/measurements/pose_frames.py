@@ -127,7 +127,7 @@ def frame_tips(on: Sequence[str] | None, frames: int) -> tuple[str, ...]:
 
 
 def kind_of_points(points: int, lever: float | None) -> str:
-    """What so many points are, such as "2 marker(s)", "poses" or "poses on 2 tips"."""
+    """Phrase for a number of points, such as "2 marker(s)", "poses" or "poses on 2 tips"."""
     frames = points // POINTS
     return f"{points} marker(s)" if lever is None else f"poses on {frames} tips" if frames > 1 else "poses"
 

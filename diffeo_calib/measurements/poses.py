@@ -30,7 +30,7 @@ MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 ROUNDING = 2e-15
 """Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
-FLATTEST = 1e-3
+FLATTEST_TRIANGLE_LEVERS = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""
 
 ONE_POSE = "pass one rigid transform per row, (N, 4, 4), or one for each of T tips, (N, T, 4, 4)"
@@ -203,8 +203,8 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     centre = places.mean(1)
     spread = (places - centre[:, None]).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
     thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
-    if bool((thickness < FLATTEST).any()):
-        row = int((thickness < FLATTEST).nonzero()[0])
+    if bool((thickness < FLATTEST_TRIANGLE_LEVERS).any()):
+        row = int((thickness < FLATTEST_TRIANGLE_LEVERS).nonzero()[0])
         what = f"row {row}: the three points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
     return transforms(se3.nearest_rotations(spread), centre)

@@ -271,7 +271,7 @@ class Readings(RowTable):
 
     @property
     def column_kind(self) -> object:
-        """What tables that can be joined into one table have in common."""
+        """Key that is equal for tables that can be joined into one."""
         return self.kind, self.offset_std, self.intrinsics, self.unit, self.std is None
 
     @property

@@ -45,7 +45,7 @@ REPEAT_TOLERANCE = 1e-3
 RANGES = ("column", "from [rad or m]", "to", "degrees")
 """Header of the ranges that notebooks show."""
 CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
-"""What stays together in a split."""
+"""Words for what a split keeps together."""
 
 
 def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
@@ -265,7 +265,7 @@ class RowGroups:
 
     @property
     def _kind(self) -> str:
-        """What these labels are of."""
+        """Word for what a split keeps together here."""
         return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 

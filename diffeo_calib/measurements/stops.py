@@ -28,7 +28,7 @@ FEWEST_CHANGES = 4
 
 @dataclass(frozen=True)
 class StopLimits:
-    """What counts as a stop.
+    """Definition of a stop.
 
     Args:
         joints: largest motion of a joint, rad or m. seen: of what is seen, m, unless its noise is larger.

@@ -306,7 +306,7 @@ class Measurements(ImageTable, SocketTable):
 
     @property
     def bodies(self) -> Bodies:
-        """What the rows show: markers, or frames."""
+        """Bodies in the rows: markers, or frames."""
         return bodies_of(self.lever)
 
     @property
@@ -330,7 +330,7 @@ class Measurements(ImageTable, SocketTable):
 
     @property
     def body_names(self) -> list[str]:
-        """What messages call the markers or frames, such as "marker 0", "the frame on 'hand'"."""
+        """Names of markers or frames in messages, such as "marker 0", "the frame on 'hand'"."""
         if self.lever is None:
             return [f"marker {name}" for name in self.marker_names or range(self.markers)]
         frames = self.markers // POINTS
@@ -338,14 +338,14 @@ class Measurements(ImageTable, SocketTable):
 
     @property
     def kind(self) -> str:
-        """What the rows are: "position", "pose" or "socket"; "mixture" for positions and sockets."""
+        """Kind of the rows: "position", "pose" or "socket"; "mixture" for positions and sockets."""
         if self.sockets is not None:
             return "socket" if self.without_device and self.markers == 1 else "mixture"
         return "position" if self.poses is None else "pose"
 
     @property
     def column_kind(self) -> object:
-        """What tables that can be joined into one table have in common."""
+        """Key that is equal for tables that can be joined into one."""
         return self.kind
 
     @property
@@ -386,7 +386,7 @@ class Measurements(ImageTable, SocketTable):
 
     @property
     def frame_prefixes(self) -> list[str]:
-        """What the names of the columns of each measured frame begin with: nothing for a single one, else TIP_."""
+        """Prefix of the columns of each measured frame: empty for a single one, else TIP_."""
         frames = 0 if self.frames is None else self.frames.shape[1]
         return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
 
@@ -454,7 +454,7 @@ class Measurements(ImageTable, SocketTable):
 
     @property
     def set_up_hint(self) -> str:
-        """What to do about rows of several set-ups that do not fit a model; empty where none is named."""
+        """Advice on rows of several set-ups that do not fit a model; empty where none is named."""
         hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
         return "" if self.session is None else hint
 

@@ -110,7 +110,7 @@ def page(
 
 
 def warnings_of(model: CalibratedKinematics) -> list[str]:
-    """What the fit of a model warned of."""
+    """Warnings of the fit of a model."""
     summary = model.summary
     return [] if summary is None or summary.warnings is None else summary.warnings.split("\n")
 

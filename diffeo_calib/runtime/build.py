@@ -23,7 +23,7 @@ from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
-COINCIDENT = 1e-6
+COINCIDENT_FRAMES_M = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
@@ -120,7 +120,7 @@ class NominalChain:
     @cached_property
     def distinct(self) -> np.ndarray:
         """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
-        far = np.linalg.norm(self.offsets[:, :3, 3], axis=1) > COINCIDENT
+        far = np.linalg.norm(self.offsets[:, :3, 3], axis=1) > COINCIDENT_FRAMES_M
         ends = (self.before < 0) & (np.arange(len(self.before)) >= len(self.axes))
         return far | np.where(self.before < 0, ends, ~self.revolute[self.before])
 

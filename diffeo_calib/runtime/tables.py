@@ -90,12 +90,12 @@ PROFILES: dict[str, Profile] = {
 TOLERANCE = 1e-13
 """Largest error of a table, rad; for fields above 1 rad relative to the largest."""
 FEWEST_CELLS, MOST_CELLS = 64, 16384
-NARROWEST = 1e-5
+CLOSEST_KNOTS_RAD = 1e-5
 """Kinks closer than this to a knot, rad, become no knots of their own."""
 BLOCK = 1 << 14
 """Largest number of kernel values that are held at once."""
 TURN = 2 * np.pi
-APART = 8.0
+CIRCLE_SPACING_RAD = 8.0
 """Distance between the circles of two joints on the line where all cells are searched at once; more than 2 pi."""
 
 
@@ -215,7 +215,7 @@ class JointTables:
 
     @cached_property
     def _shifts(self) -> Array:
-        return APART * np.arange(len(self.joints), dtype=np.float64)
+        return CIRCLE_SPACING_RAD * np.arange(len(self.joints), dtype=np.float64)
 
     @cached_property
     def _lines(self) -> list[tuple[Array, Array]]:
@@ -272,5 +272,5 @@ def _derivatives(sums: Sequence[PeriodicSum], x: Array) -> Array:
 def _apart(places: Array) -> Array:
     """Sorted places from 0 to 2 pi, without those that hardly differ from the one before."""
     places = np.sort(places)
-    kept = places[np.concatenate([[True], np.diff(places) > NARROWEST])]
-    return np.concatenate([kept[kept < TURN - NARROWEST], [TURN]])
+    kept = places[np.concatenate([[True], np.diff(places) > CLOSEST_KNOTS_RAD])]
+    return np.concatenate([kept[kept < TURN - CLOSEST_KNOTS_RAD], [TURN]])

@@ -34,7 +34,7 @@ class Explained:
 
     @property
     def arm(self) -> float:
-        """What the arm's own errors explain."""
+        """Part that the arm's own errors explain."""
         return max(self.nominal**2 - self.lens**2 - self.board**2 - self.corners**2, 0.0) ** 0.5
 
     def sentence(self) -> str:

@@ -26,7 +26,7 @@ SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
 ROUNDS = 20
 """Steps of a refinement."""
-TAIL = 3.0
+OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
@@ -62,7 +62,7 @@ class Devices(ABC):
     kind: ClassVar[str]
     """Of the readings: :attr:`Readings.kind`."""
     size_fix: ClassVar[str]
-    """What to measure where readings of this kind hold too little length."""
+    """Advice where readings of this kind say too little about length."""
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
@@ -194,7 +194,7 @@ class Devices(ABC):
             yield name, effects * (device == number)[:, None, None]
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
-        """What these devices cannot see wherever the robot goes, and what to do."""
+        """Directions that these devices cannot see wherever the robot goes, and advice."""
         yield from ()
 
     @classmethod
@@ -253,7 +253,7 @@ class Devices(ABC):
         return values / self.metres[self.numbers(data)][:, None] * data.unit[1]
 
     def shared(self, points: Tensor, device: Tensor) -> Tensor:
-        """What is not known of the devices, as effects of unit variance that rows share: (N, r, D k)."""
+        """Uncertainty of the devices, as effects of unit variance that rows share: (N, r, D k)."""
         own = self.observation(device).by_constants(points) * self.deviations  # (N, r, k)
         whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
         return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
@@ -265,7 +265,7 @@ class Devices(ABC):
             errors, slopes = devices.errors(data, points), devices.shared(points, devices.numbers(data))
             size = errors.norm(dim=1, keepdim=True)
             level = size.median().clamp(min=SMALLEST_MEDIAN_M)
-            weight = (1 / (1 + (size / (TAIL * level)) ** 2).sqrt() / level)[..., None]
+            weight = (1 / (1 + (size / (OUTLIER_MEDIANS * level)) ** 2).sqrt() / level)[..., None]
             eye = torch.eye(slopes.shape[2], dtype=slopes.dtype, device=slopes.device)
             matrix = torch.cat([(weight * slopes).flatten(0, 1), eye])
             target = torch.cat([(weight[..., 0] * errors).flatten(), eye[0] * 0.0])

@@ -67,7 +67,7 @@ class KnownDrift:
         return cls(own.names, joints, lowest, highest, own.constants[0, 2:5], own.constants[:, 5:], own.deviations)
 
     def placed(self) -> PlacedDevices:
-        """What a model keeps."""
+        """Entries for the model file."""
         centre = self.centre.expand(len(self.names), 3)
         constants = torch.cat([self.lowest[:, None], self.highest[:, None], centre, self.sizes], 1)
         return PlacedDevices.outside(DRIFT, self.names, constants.to(HOST), self.deviations.to(HOST))
@@ -119,7 +119,7 @@ class KnownDrift:
             yield f"drift with {name} from {low:g} to {high:g}: {what}; the model holds for {0.5 * (low + high):g}"
 
     def in_rows(self, data: Any) -> Iterator[str]:
-        """What is done about the drift in rows that are judged."""
+        """Sentence on how the drift is treated in rows that are judged."""
         told = [name for name in self.names if name in data.drifting]
         if told:
             yield f"the drift with {' and '.join(told)} that the fit found is part of the predictions of these rows"

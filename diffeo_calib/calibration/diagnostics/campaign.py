@@ -1,4 +1,4 @@
-"""What a campaign leaves open: markers and frames that it does not determine, paths in a plane, one joint at a time.
+"""Directions a campaign leaves open: markers and frames it does not determine, paths in a plane, single joints.
 
 So do joint values of few digits: what their rounding does to the positions is told, too. The calibration goes on, and
 its predictions carry the deviations that follow. The warnings say what to measure.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import few, sentence
 
-FITS = 0.3
+REMAINING_ERROR_SHARE = 0.3
 """Part of a row's error that may remain under the other label."""
 FEWEST_ROWS = 2
 MOST_MASSES = 10
@@ -41,7 +41,7 @@ def label_text(errors: Tensor, wrong: Tensor, lines: Tensor, labels: Sequence[La
     Args:
         errors: (M,) of the rows as they are labelled, m. wrong: (M,) boolean. lines: (M,). labels: others.
     """
-    found = [(wrong & one.applies & (one.errors < FITS * errors), one) for one in labels]
+    found = [(wrong & one.applies & (one.errors < REMAINING_ERROR_SHARE * errors), one) for one in labels]
     rows, label = max(found, key=lambda each: int(each[0].sum()), default=(wrong & ~wrong, None))
     if label is None or int(rows.sum()) < FEWEST_ROWS:
         return None

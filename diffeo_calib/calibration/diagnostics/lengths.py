@@ -25,7 +25,7 @@ from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 
 @dataclass(frozen=True)
 class LengthLimits:
-    """What is usual, and when something else is reported.
+    """Usual deviations of lengths, and when a larger one is reported.
 
     Args:
         translation_m, rotation_rad: of the errors of links. coupled_rad, task_m: amplitudes of the fields; what these

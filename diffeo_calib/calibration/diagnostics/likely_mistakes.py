@@ -26,7 +26,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
-MOVED = 1e-3
+UNMOVED_JOINT_RANGE = 1e-3
 """Range of a joint, rad or m, below which it never moved."""
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
@@ -99,7 +99,7 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
             _joint_values(columns, spare[name], slides=not longer.periodic[robot.n + k]) for k, name in enumerate(added)
         ]
         q = torch.cat([data.q, torch.stack(values, dim=1).to(data.q.device)], dim=1)
-        if not bool((q[:, robot.n :].amax(0) - q[:, robot.n :].amin(0) > MOVED).all()):
+        if not bool((q[:, robot.n :].amax(0) - q[:, robot.n :].amin(0) > UNMOVED_JOINT_RANGE).all()):
             continue
         what = f"the table has a column for joint '{joint}', which is below the tip '{robot.tip}'"
         yield Reading(longer, q, data.points, f"{what}: choose '{child}' or a link below it as the tip")

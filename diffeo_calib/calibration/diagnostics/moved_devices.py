@@ -35,7 +35,7 @@ from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.se3 import skew
 
-RIDGE = 1e-9
+RELATIVE_RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""
 
 
@@ -148,7 +148,7 @@ class Finding(NamedTuple):
         return chance_of_jump(gain, unknowns, limits.fewest_rows / len(self.columns))
 
     def words(self, limits: ChangeLimits) -> str:
-        """What changed, and by how much."""
+        """Phrase for the change and its size."""
         verb, change = "to drift" if self.drifts else "to have moved", self.point.change
         if self.cause.unit is not None:
             unit, size = self.cause.unit
@@ -158,7 +158,7 @@ class Finding(NamedTuple):
         return f"{name} seems {verb} by about {1e3 * distance:.2g} mm"
 
     def _moved(self, limits: ChangeLimits) -> tuple[str, float]:
-        """What moved, and how far, m."""
+        """Phrase for what moved, and how far, m."""
         motion, basis = self.point.motion, self.cause.basis
         motion = motion if basis is None else (basis @ motion[:, :, None])[:, :, 0]
         size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
@@ -332,8 +332,8 @@ def _normal(columns: Tensor, dense: CholeskyRegression) -> Tensor:
 
 
 def _ridge(H: Tensor) -> Tensor:
-    """What keeps H (..., U, U) invertible where rows do not determine all unknowns."""
-    level = RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
+    """Ridge that keeps H (..., U, U) invertible where rows do not determine all unknowns."""
+    level = RELATIVE_RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
     return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
 
 
@@ -343,7 +343,7 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
 
 
 def causes_of(data: TangentData) -> list[Cause]:
-    """What may change of robot, tool and measuring frame, and its effects on all rows."""
+    """Possible changes of robot, tool and measuring frame, and their effects on all rows."""
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
     base, markers = _base_motions(points), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
     if data.basis is not None:  # nothing bends a frame
@@ -383,7 +383,7 @@ def find_change_point(
     blocks = torch.einsum("iujk,jkv->ijuv", half, effects)[order][:, order]
     H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
     g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
-    H = H + RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
+    H = H + RELATIVE_RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
     u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]  # noise-free rows may leave H singular
     gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
     count = int(gains.argmax()) + fewest_rows  # rows after the change point

@@ -146,7 +146,7 @@ class SocketLimits:
 LIMITS = SocketLimits()
 RAISED = 0.2
 """Distance of the new place from the plane, relative to the largest distance of a socket from the base."""
-WORTH = 0.8
+WORTHWHILE_ERROR_RATIO = 0.8
 """Expected error with the new place, relative to that without it, below which it is advised."""
 STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
@@ -275,7 +275,7 @@ def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, pl
     step = RAISED * reach * axes[2]
     tried = (with_raised_place(fitted, *resting, sign * step) for sign in (1.0, -1.0))
     errors = [error for error in tried if error is not None]
-    if errors and min(errors) < WORTH * now:
+    if errors and min(errors) < WORTHWHILE_ERROR_RATIO * now:
         what = "the sockets lie near a plane"
         expected = (
             f"about {1e3 * min(errors):.2g} mm of error with one place {1e3 * RAISED * reach:.0f} mm away from it"

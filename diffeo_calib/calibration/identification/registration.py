@@ -141,7 +141,7 @@ ROUNDS = 30
 """Most rounds of weighing rows."""
 SETTLED = 1e-6
 """Largest change of a weight at which these rounds end."""
-MEDIANS = 2.0
+HALF_WEIGHT_MEDIANS = 2.0
 """Distance, in medians, at which a row has half its weight."""
 
 
@@ -200,7 +200,7 @@ def socket_means(points: Tensor, socket: Tensor) -> Tensor:
 
 def median_weights(distances: Tensor) -> Tensor:
     """Weights (N,) of rows by their distances (N,) in medians: 1 / (1 + (d / 2 medians)^2)."""
-    scale = MEDIANS * distances.median().clamp(min=LIMITS.smallest_noise_m)
+    scale = HALF_WEIGHT_MEDIANS * distances.median().clamp(min=LIMITS.smallest_noise_m)
     return 1.0 / (1.0 + (distances / scale).square())
 
 

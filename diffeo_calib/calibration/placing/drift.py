@@ -22,7 +22,7 @@ from diffeo_calib.sensors.places import PlacedDevices
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""
-WORTH = 0.97
+WORTHWHILE_ERROR_RATIO = 0.97
 """Part of the RMS leave-one-out error that may remain at most with the drift in the model."""
 SURE = 3.0
 """Standard deviations from which a gain in squared errors is no chance."""
@@ -98,7 +98,7 @@ class Drift(DeviceSet):
 
     @property
     def known(self) -> KnownDrift | None:
-        """What a fit found; None before."""
+        """Drift that a fit found; None before."""
         if self.size_by_column is None or self.deviations is None or self.centre is None:
             return None
         ends = self.lowest, self.highest
@@ -123,4 +123,4 @@ def worth_it(before: LeaveOneOut, after: LeaveOneOut) -> bool:
     first, second = (one.errors.square().nansum(1) for one in (before, after))
     gain = first - second
     sure = float(gain.mean()) > SURE * float(gain.std()) / len(gain) ** 0.5
-    return sure and float(second.mean()) < WORTH**2 * float(first.mean())
+    return sure and float(second.mean()) < WORTHWHILE_ERROR_RATIO**2 * float(first.mean())

@@ -80,7 +80,7 @@ class OtherRows(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """What a fit says about the shifts of one set of devices.
+    """Result of a fit for the shifts of one set of devices.
 
     Args:
         shifts: (c,) their posterior mean.
@@ -111,7 +111,7 @@ class DeviceSet(ABC):
 
     @abstractmethod
     def effects(self, data: SeenRows) -> Tensor:
-        """What is not known of the devices, as effects of unit variance that rows share: (N, R, c), m."""
+        """Uncertainty of the devices, as effects of unit variance that rows share: (N, R, c), m."""
 
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
@@ -135,7 +135,7 @@ class DeviceSet(ABC):
 
     @abstractmethod
     def placed(self) -> PlacedDevices | None:
-        """What a model keeps of them; None for nothing."""
+        """Their entries for the model file; None for nothing."""
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -145,7 +145,7 @@ class DeviceSet(ABC):
         return ()
 
     def changes(self, data: SeenRows) -> Iterable[Cause]:
-        """What of these devices may change during the measurements, with its effects (N, R, U) on all rows."""
+        """Possible changes of these devices during the measurements, with their effects (N, R, U) on all rows."""
         return ()
 
     def groups(self) -> Iterable[tuple[str, Tensor]]:
@@ -195,7 +195,7 @@ class Placement:
         return next((own for own in self.sets if isinstance(own, kind)), None)
 
     def changes(self, data: SeenRows) -> list[Cause]:
-        """What of all devices may change."""
+        """Possible changes of all devices."""
         return [cause for own in self.sets for cause in own.changes(data)]
 
     def groups(self) -> Iterable[tuple[str, Tensor]]:
@@ -253,7 +253,7 @@ class Placement:
         return found
 
     def placed(self) -> tuple[PlacedDevices, ...]:
-        """What a model keeps of all devices."""
+        """Entries of all devices for the model file."""
         return tuple(found for own in self.sets if (found := own.placed()) is not None)
 
 

@@ -53,7 +53,7 @@ TOLD_APART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Sessions(DeviceSet):
-    """What differs between the rows of some sessions: measuring frames, or where markers sit.
+    """Difference between sessions: measuring frames, or where markers sit.
 
     Args:
         names: of the sessions.

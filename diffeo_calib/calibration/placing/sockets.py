@@ -98,7 +98,7 @@ class SocketPlaces:
         return cls(sockets, positions + (root @ (root.mT @ push)).view(-1, 3), root)
 
     def shared(self, socket: Tensor, coordinates: int) -> Tensor:
-        """What is not known of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m.
+        """Uncertainty of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m.
 
         Args:
             socket: (N,) number of each row's socket, -1 for none. coordinates: 3 P.

@@ -132,7 +132,7 @@ MOST_TURNS = 10
 ROUNDING = 1e-6
 """Of limits in files, rad or m."""
 MOST = 10_000_000
-BATCH = 4096
+CONFIGURATIONS_AT_ONCE = 4096
 """Configurations that are drawn together."""
 FIRST_DRAWS = 100_000
 REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
@@ -201,7 +201,7 @@ def candidates(
     passed = dict.fromkeys(criteria, 0)
     drawn = accepted = 0
     while accepted < count:
-        q = torch.rand(BATCH, robot.n, dtype=torch.float64, device=HOST, generator=generator)
+        q = torch.rand(CONFIGURATIONS_AT_ONCE, robot.n, dtype=torch.float64, device=HOST, generator=generator)
         q = lower + (upper - lower) * q
         if places is not None:
             q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
@@ -209,7 +209,7 @@ def candidates(
             seen[name] += len(q)
             q = q[_allowed(name, criterion, q)] if len(q) else q
             passed[name] += len(q)
-        drawn, accepted = drawn + BATCH, accepted + len(q)
+        drawn, accepted = drawn + CONFIGURATIONS_AT_ONCE, accepted + len(q)
         found.append(q)
         if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
             raise _too_few(drawn, accepted, seen, passed)

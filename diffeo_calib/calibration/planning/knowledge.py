@@ -1,4 +1,4 @@
-"""What is known about the markers at many configurations before the next measurement, and the best one to make.
+"""Covariance of the markers at many configurations before the next measurement, and the best one to make.
 
 What is known before the first one is that of a robot by its description, or of a fitted model.
 
@@ -230,7 +230,7 @@ def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, sce
 
 
 USUAL_RESIDUAL = 3e-4
-"""What the geometric calibration of an industrial robot leaves per coordinate, relative to the markers' spread."""
+"""Residual of the geometric calibration of an industrial robot per coordinate, relative to the markers' spread."""
 MARKER = (0.1, 0.0, 0.1)
 """Default marker in the tip's frame, m: off the axis of the last joint, so that this joint moves it."""
 FREE = ("base", "marker", "both")

@@ -152,7 +152,7 @@ class Plan:
 
     @property
     def caution(self) -> str:
-        """What to think of ``expected_rms`` if it rests on usual scales."""
+        """Caveat on ``expected_rms`` if it rests on usual scales."""
         return "before any measurement these errors are guesses for an industrial robot and a tracker, perhaps far off"
 
     @property
@@ -276,7 +276,7 @@ def plan(
 
 
 def _in_order(robot: Tree, q: Tensor, chosen: Options, first: int) -> dict[str, Any]:
-    """What a plan says about each pose, in an order of short moves; ``first``: row number of the first candidate."""
+    """Columns of a plan for each pose, in an order of short moves; ``first``: row number of the first candidate."""
     rows = chosen.rows - first
     path = short_path(move_times(q[rows], robot.periodic))
     names = tuple(chosen.names[number] for number in chosen.device[path].tolist())
@@ -285,7 +285,7 @@ def _in_order(robot: Tree, q: Tensor, chosen: Options, first: int) -> dict[str, 
 
 
 def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
-    """What will measure: the argument of :func:`plan`, or what it stands for."""
+    """Sensors: the argument of :func:`plan`, or what it stands for."""
     if sensor is None:
         return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
     several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)

@@ -1,4 +1,4 @@
-"""What will measure planned poses: a tracker, or devices in new places, and what each would show of a model's points.
+"""Sensors for planned poses: a tracker, or devices in new places, and what each would show of a model's points.
 
 A measurement at x shows, to first order, A z(x) + D c + noise: A the slope of what is reported by the coordinates z of
 the model's points, c ~ N(0, I) what is not known about the devices.
@@ -122,7 +122,7 @@ class Options(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensor(ABC):
-    """What will measure the planned poses; see the constructors :meth:`positions` to :meth:`sockets`.
+    """Sensors for planned poses; see the constructors :meth:`positions` to :meth:`sockets`.
 
     Places are in the robot's base frame, m, and need not be exact: the plan takes them as unknown by 0.1 m.
 

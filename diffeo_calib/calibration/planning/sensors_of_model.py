@@ -1,4 +1,4 @@
-"""What measured the rows of a model, as what will measure planned poses: devices where the fit found them."""
+"""Sensors of a model's rows, reused for planned poses: devices where the fit found them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_NUMBERS = 2
 
 
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
-    """What the rows of a model were measured with, devices of readings and sockets where the fit found them.
+    """Sensors that measured the rows of a model, devices of readings and sockets where the fit found them.
 
     Where the model does not know its devices (files of old versions, and registered models) they are read off the map,
     which keeps the slopes of its rows and the effects of its devices.

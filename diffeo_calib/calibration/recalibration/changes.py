@@ -1,4 +1,4 @@
-"""What has changed since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
+"""Changes since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
 
 The residuals r of new rows are N(0, K_0) if only device and markers have moved; if part k has changed, too, they are
 N(0, K_0 + s^2 G_k), with G_k the covariance of that part in the old model and s^2 the variance of the change relative
@@ -31,7 +31,7 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 
-DRAWS = 2000
+SIMULATED_DRAWS = 2000
 NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
 """Factors 0.4 to 12 on the variance of the noise: another device, another day."""
 SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)
@@ -72,7 +72,7 @@ def likelihood_ratios(
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
     factors = NOISE_FACTORS.to(base)
     likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]
-    draws = torch.randn(len(R), DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
+    draws = torch.randn(len(R), SIMULATED_DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
     samples = torch.cat([residual, torch.linalg.cholesky(base + likeliest * R) @ draws], 1)
     densities = [_Density(base + f * R, samples) for f in factors]
     without = torch.stack([density.plain for density in densities]).amax(0)
@@ -86,7 +86,7 @@ def likelihood_ratios(
     found = {}
     for name, values in ratios.items():
         value = float(values[0])
-        found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + DRAWS), variances[name])
+        found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + SIMULATED_DRAWS), variances[name])
     return found, float(likeliest.sqrt())
 
 
@@ -118,7 +118,7 @@ SMALLEST_AMPLITUDE_SHARE = 0.5
 """A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
 OFFSET_DEVIATION_RAD_M = 3e-4
 """Of a joint offset, to which the sizes above are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE = 1e-6
+NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
 """Eigenvalues of a transmission's covariance below this share of the largest are left out."""
 
 
@@ -164,7 +164,7 @@ class Transmission(ChangedPart):
     def root(self, at: Linearisation) -> Tensor:
         """See :class:`ChangedPart`."""
         values, vectors = torch.linalg.eigh(self._covariance(at))
-        kept = values > NEGLIGIBLE * values[-1]
+        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
         shapes = vectors[:, kept] * values[kept].sqrt()  # (M, c)
         return at.joint_to_start[:, :, self.joint, None] * shapes[:, None]
 
@@ -297,7 +297,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Changes:
-    """What has changed, the clearest first.
+    """Changes, the clearest first.
 
     Args:
         found: the changes.

@@ -145,7 +145,7 @@ def compare(
     count: int = 1000,
     seed: int = 0,
 ) -> Comparison | ModelComparison:
-    """What has changed since a calibration.
+    """Find what has changed since a calibration.
 
     Args:
         model: a calibrated model.

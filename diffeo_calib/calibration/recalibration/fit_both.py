@@ -165,7 +165,7 @@ LEAST_GAIN = 4.0
 """Log evidence by which drift must explain the rows better: what chance exceeds in one of twenty, for three sizes."""
 LEAST_GAIN_OF_INLIERS = 0.5
 """The same where rows that do not fit the old model have hardly any weight: outliers look like a change."""
-RANGE = -12.0, 4.0
+LOG_VARIANCE_RANGE = -12.0, 4.0
 """Of the logarithm of s^2."""
 
 
@@ -214,12 +214,12 @@ def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor, gain: 
         by_size = torch.stack([(slope * gram).sum() for gram in grams]) * logs.exp() + away / EFOLDS
         return float(value), by_size.numpy()
 
-    bounds = [RANGE] * len(grams)
+    bounds = [LOG_VARIANCE_RANGE] * len(grams)
     starts = [np.full(len(grams), start) for start in STARTS]
     found = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     best = min(found, key=lambda each: float(each.fun))
-    still, _ = objective(np.full(len(grams), RANGE[0]))
-    prior = 0.5 * len(grams) * ((RANGE[0] - log(USUAL_SIZE)) / EFOLDS) ** 2
+    still, _ = objective(np.full(len(grams), LOG_VARIANCE_RANGE[0]))
+    prior = 0.5 * len(grams) * ((LOG_VARIANCE_RANGE[0] - log(USUAL_SIZE)) / EFOLDS) ** 2
     if still - prior - float(best.fun) < gain:
         return None
     return [exp(value) for value in best.x.tolist()]

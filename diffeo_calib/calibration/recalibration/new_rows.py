@@ -49,7 +49,7 @@ NOISE_EFOLDS = 2.0
 
 
 class Measured(NamedTuple):
-    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
+    """New rows in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
 
     y: Tensor
     noise_model: NoiseModel
@@ -119,7 +119,7 @@ class NewRows:
 
     @cached_property
     def at(self) -> Linearisation:
-        """What was measured by the old model, linearised."""
+        """Linearised prediction of the old model for the measured numbers."""
         return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
 
     @cached_property

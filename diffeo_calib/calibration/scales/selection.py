@@ -30,7 +30,7 @@ MESHING_LENGTHSCALE_RAD = 0.22
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
 (tens of periods per turn) and eccentricity (one)."""
-REJECTED = 1e12
+OBJECTIVE_OF_FAILURE = 1e12
 """Objective where G + R cannot be factorised: the line search then shortens its step."""
 
 
@@ -230,7 +230,7 @@ class _Search:
         point = torch.from_numpy(vector)
         found = log_posterior(point, self.centre, self.data)
         if found is None:
-            return REJECTED, np.zeros_like(vector)
+            return OBJECTIVE_OF_FAILURE, np.zeros_like(vector)
         value = found.likelihood + found.prior
         if value > self.best_value:
             self.best, self.best_value = self.centre.from_logarithms(point), value

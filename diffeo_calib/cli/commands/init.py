@@ -19,7 +19,7 @@ from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
-CLEAR = 0.2
+CLEAR_RESIDUAL_RATIO = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
 COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
 """Entries that name columns."""
@@ -115,7 +115,7 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     (length, angle, camera), best = min(residuals.items(), key=lambda entry: entry[1])
     others = min(value for units, value in residuals.items() if units != (length, angle, camera))
     found = source.words(best, others)
-    if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
+    if not best < proposals.LARGEST_RESIDUAL or best > CLEAR_RESIDUAL_RATIO * others:
         seen = [Choice(*entry) for entry in proposals.camera(source, sheet)]
         if seen:
             yield from seen

@@ -34,9 +34,9 @@ WAVE_COST = 0.5
 """Time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)."""
 POINT_COST = 150.0
 """Time of a point beside its waves, relative to that of a pair."""
-CHUNK = 1 << 20
+WAVES_TIMES_POINTS_AT_ONCE = 1 << 20
 """Waves times points in memory at once."""
-CHECKED = 24
+CHECKED_ROWS = 24
 """Rows and columns at which every lattice is checked."""
 
 
@@ -71,7 +71,7 @@ def sums(
 
 def _displacements(rows: Tensor, columns: Tensor, extent: Tensor) -> Tensor:
     """Some differences of points, and the largest possible one, where the copies of the kernel are nearest."""
-    count = min(CHECKED, len(rows), len(columns))
+    count = min(CHECKED_ROWS, len(rows), len(columns))
     every = [torch.arange(count, device=t.device, dtype=torch.int64) * (len(t) - 1) // count for t in (rows, columns)]
     apart = rows[every[0], None] - columns[every[1]][None]
     return torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
@@ -158,7 +158,7 @@ class Lattice:
         return first, rest
 
     def _chunks(self, count: int) -> list[slice]:
-        size = max(1, CHUNK // max(self.size // len(self.axes[0]), len(self.axes[0])))
+        size = max(1, WAVES_TIMES_POINTS_AT_ONCE // max(self.size // len(self.axes[0]), len(self.axes[0])))
         return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
 
 

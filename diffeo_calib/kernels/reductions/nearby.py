@@ -65,7 +65,7 @@ def _first_below(values: Tensor, level: float) -> float | None:
 
 BLOCK = 128
 """Most points of a block: small enough for tight boxes, large enough for the overhead of a block."""
-WORTHWHILE = 0.7
+WORTHWHILE_NEAR_SHARE = 0.7
 """Share of near pairs below which it pays. Sums over all pairs of one cloud visit half of them."""
 
 
@@ -81,7 +81,7 @@ def sums(
         column_blocks = blocks(columns.features)
         row_blocks = column_blocks if rows is None else blocks(at.features)
         near = _near(_boxes(at.features, row_blocks), _boxes(columns.features, column_blocks), distance)
-        if float(near.to(torch.float64).mean()) > WORTHWHILE * (0.5 if rows is None else 1.0):
+        if float(near.to(torch.float64).mean()) > WORTHWHILE_NEAR_SHARE * (0.5 if rows is None else 1.0):
             return None
         return _over_blocks(formula, profile, (at, row_blocks), (columns, column_blocks), near)
 

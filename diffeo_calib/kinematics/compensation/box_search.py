@@ -29,12 +29,12 @@ from diffeo_calib.robots.tree import Tree
 
 MOTION_COST = 1e-10
 """m^2 per rad^2 (or per m^2 of a slide)."""
-IMMOBILE = 1e-13
+IMMOBILE_MOBILITY = 1e-13
 """Mobility of joints that must not move: they give way by less than a microradian for a miss of 0.1 m."""
 MOST_STEPS = 100
-SETTLED = 1e-12
+SETTLED_STEP = 1e-12
 """No joint moves by more than this any more, rad or m."""
-NEAR = 1e-4
+NEAR_TARGET_M = 1e-4
 """Errors below this, in m, are worth a last search for the target itself."""
 LEAST_DAMPING, START_DAMPING = 1e-12, 1e-9
 ROUNDING = 1e-15
@@ -65,7 +65,7 @@ class _Search:
         self.tool, self.targets, self.box = tool, targets, box
         self.q, self.poses = q.copy(), poses.copy()
         count, n = q.shape
-        mobility = np.where(box.mobility > 0, np.maximum(box.mobility, 1e-9), IMMOBILE)
+        mobility = np.where(box.mobility > 0, np.maximum(box.mobility, 1e-9), IMMOBILE_MOBILITY)
         self.pull = MOTION_COST / mobility  # (N, n)
         self.cost = self._cost(np.arange(count), q, poses)
         self.damping, self.growth = np.full(count, START_DAMPING), np.full(count, 2.0)
@@ -89,7 +89,7 @@ class _Search:
         taken = rows[good]
         self.q[taken], self.poses[taken], self.cost[taken] = moved[good], seen[good], cost[good]
         self._adapt(rows, gain)
-        still = np.abs(step).max(1, initial=0.0) <= SETTLED
+        still = np.abs(step).max(1, initial=0.0) <= SETTLED_STEP
         still |= promised <= np.maximum(SMALLEST_GAIN, noise)
         still |= good & reached(self.targets.take(rows), seen)
         self._linearise(rows[good & ~still])
@@ -137,7 +137,7 @@ def _convex(hessian: Array, blocked: Array) -> Array:
 def _finished(tool: ToolFunctions, targets: Targets, q: Array, box: Box, poses: Array) -> tuple[Array, Array, Array]:
     """The cost of motion keeps rows a little away from their targets: go there with the joints that are free."""
     done = reached(targets, poses)
-    rows = np.flatnonzero(~done & (np.linalg.norm(targets.errors(poses), axis=1) < NEAR))
+    rows = np.flatnonzero(~done & (np.linalg.norm(targets.errors(poses), axis=1) < NEAR_TARGET_M))
     if len(rows):
         inside, goal = box.take(rows), targets.take(rows)
         free = (q[rows] > inside.low) & (q[rows] < inside.high)
@@ -201,7 +201,7 @@ TURN_BOUND = radians(1.0)
 """Default bound of a correction of a turning joint, rad."""
 SLIDE_BOUND = 0.02
 """Default bound of a correction of a slide, m."""
-SLACK = 1e-9
+LIMIT_SLACK = 1e-9
 """Starts beyond a limit by less than this, rad or m, come from rounding."""
 
 
@@ -227,7 +227,7 @@ class Limits:
         NaN where they are beyond their limits at the start already.
         """
         before, change = start @ self.matrix.T, (q - start) @ self.matrix.T  # (N, k)
-        outside = ((before < self.least - SLACK) | (before > self.most + SLACK)).any(1)
+        outside = ((before < self.least - LIMIT_SLACK) | (before > self.most + LIMIT_SLACK)).any(1)
         end = np.where(change > 0, self.most, self.least)
         share = np.where(change != 0, (end - before) / np.where(change != 0, change, 1.0), np.inf)
         share = np.clip(share.min(1, initial=1.0), 0.0, 1.0)

@@ -14,12 +14,12 @@ import numpy as np
 from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions
 from diffeo_calib.kinematics.compensation.targets import Array, Targets
 
-REACHED = 5e-10
+REACHED_MISS = 5e-10
 """Miss in m and rad at which a row counts as reached: half of what is promised."""
 MOST_STEPS = 8
-SLOWEST = 0.3
+SLOWEST_CONTRACTION = 0.3
 """A step must leave less than this fraction of the error."""
-TINY = 1e-12
+RELATIVE_RIDGE = 1e-12
 """Part of the trace that keeps singular matrices invertible; rows where it matters are given up."""
 
 
@@ -51,7 +51,7 @@ class Box:
 def reached(targets: Targets, poses: Array) -> Array:
     """(N,) whether each tool is at its target."""
     distance, angle = targets.misses(poses)
-    return np.all((distance if angle is None else np.maximum(distance, angle)) <= REACHED, axis=1)
+    return np.all((distance if angle is None else np.maximum(distance, angle)) <= REACHED_MISS, axis=1)
 
 
 def chord_search(
@@ -87,7 +87,7 @@ def chord_search(
         seen = tool.poses(at)
         fresh = goal.independent(goal.errors(seen))
         arrived = reached(goal, seen)
-        good = arrived | (np.linalg.norm(fresh, axis=1) < SLOWEST * np.linalg.norm(error, axis=1))
+        good = arrived | (np.linalg.norm(fresh, axis=1) < SLOWEST_CONTRACTION * np.linalg.norm(error, axis=1))
         q[todo[good]], poses[todo[good]], done[todo[arrived]] = at[good], seen[good], True
         keep = good & ~arrived
         inverse = _updated(inverse[keep], step[keep], (error - fresh)[keep])
@@ -106,7 +106,7 @@ def _right_inverse(slopes: Array, mobility: Array) -> Array:
 def _regular(square: Array) -> Array:
     """Symmetric matrices (N, k, k) with a small multiple of the identity added."""
     size = square.shape[1]
-    return square + (TINY * np.trace(square, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(size)
+    return square + (RELATIVE_RIDGE * np.trace(square, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(size)
 
 
 def _updated(inverse: Array, step: Array, gain: Array) -> Array:

@@ -41,7 +41,7 @@ from diffeo_calib.kinematics.compensation.targets import (
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 
-FOLLOWING = 10.0
+BOUND_FACTOR_BETWEEN_ROWS = 10.0
 """Default bounds where rows start at the row before, in units of the usual ones."""
 ROWS_PER_BOUND = 0.1
 """Default rate of a path without times, in bounds per row."""
@@ -172,7 +172,7 @@ def compensate(
     goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     exact, rough = tool_functions(model, tools, frame)
-    motion = largest_motion(robot, bound, FOLLOWING if following and bound is None else 1.0)
+    motion = largest_motion(robot, bound, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
     room = Room(begin, joint_limits(robot, limits), motion, mobilities(robot, weights, tuple(tools), aimed))
     problem = CompensationProblem(exact, rough, goals, room)
@@ -259,7 +259,7 @@ def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] 
 
 
 ROUNDS = 3
-CHANGED = 1e-9
+SAME_CORRECTION_TOLERANCE = 1e-9
 """Corrections that differ by more than this, rad or m, are not the same."""
 
 ROUNDING = 1e-14
@@ -293,7 +293,7 @@ class Pace:
     def jumps(self, corrections: Array) -> Array:
         """Rows whose corrections differ from those of the row before by more than the rate allows."""
         allowed = np.diff(self.times)[:, None] * self.rate
-        return 1 + np.flatnonzero((np.abs(np.diff(corrections, axis=0)) > allowed + CHANGED).any(1))
+        return 1 + np.flatnonzero((np.abs(np.diff(corrections, axis=0)) > allowed + SAME_CORRECTION_TOLERANCE).any(1))
 
 
 def _lowest(values: Array, steps: Array) -> Array:
@@ -312,8 +312,8 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
     q, held = found.q.copy(), np.zeros(found.q.shape, dtype=bool)
     for _ in range(ROUNDS):
         slow = start + pace.limited(q - start, firm)
-        held |= np.abs(slow - q) > CHANGED
-        rows = np.flatnonzero((np.abs(slow - q) > CHANGED).any(1))
+        held |= np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
+        rows = np.flatnonzero((np.abs(slow - q) > SAME_CORRECTION_TOLERANCE).any(1))
         if not len(rows):
             break
         q[rows] = _with_held_joints(problem.take(rows), slow[rows], held[rows])
@@ -338,7 +338,7 @@ def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solutio
     if len(rows):
         poses[rows] = problem.tool.poses(q[rows])
         there = reached(problem.targets.take(rows), poses[rows])
-        slowed = (np.abs(q[rows] - before.q[rows]) > CHANGED).any(1)
+        slowed = (np.abs(q[rows] - before.q[rows]) > SAME_CORRECTION_TOLERANCE).any(1)
         codes[rows[there]] = CODE[Status.reached]
         codes[rows[~there & slowed]] = CODE[Status.rate]
     return Solution(q, poses, codes)

@@ -135,7 +135,7 @@ class CompensationProblem:
         near_here, open_here = self._blames(targets, q, poses, start)
         found = (near & open_) | (near_here & open_here)
         doubtful = np.flatnonzero((near | near_here) & ~found)
-        found[doubtful] = self._reach(rows[doubtful], limited=True, scale=FARTHER)
+        found[doubtful] = self._reach(rows[doubtful], limited=True, scale=SECOND_SEARCH_BOUND_FACTOR)
         return found
 
     def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
@@ -151,7 +151,7 @@ class CompensationProblem:
         error = targets.independent(targets.errors(poses) * targets.to_metres(self.tool.length))
         U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
         parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
-        weak = s <= WEAK * s[:, :1]
+        weak = s <= WEAK_DIRECTION_SHARE * s[:, :1]
         motion = parts / np.maximum(s, 1e-300)
         strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.room.bound
         each, main = np.arange(len(q)), np.where(weak, np.abs(motion), -1.0).argmax(1)
@@ -159,7 +159,7 @@ class CompensationProblem:
         bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.room.bound))
         ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
         length = self.tool.length * np.square(v * self.room.bound).sum(1)
-        ends &= np.abs(bend) > BENT * length
+        ends &= np.abs(bend) > BENT_WORKSPACE_CURVATURE * length
         near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
         return weak.any(1) & near, ~ends
 
@@ -175,11 +175,11 @@ class CompensationProblem:
         return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound
 
 
-WEAK = 0.1
+WEAK_DIRECTION_SHARE = 0.1
 """A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
-BENT = 0.05
+BENT_WORKSPACE_CURVATURE = 0.05
 """The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
-FARTHER = 10.0
+SECOND_SEARCH_BOUND_FACTOR = 10.0
 """Multiple of the bound within which targets beyond the end are searched once more."""
 DIFFERENCE = 1e-4
 """Step in rad or m of central differences of the Jacobian."""

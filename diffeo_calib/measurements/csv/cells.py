@@ -331,7 +331,7 @@ class BadCells:
 
 
 class _Mistakes:
-    """What is wrong with the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
+    """Faults in the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
 
     def __init__(self, path: Path, wanted: Sequence[str], decimal: str, markers: int = 0) -> None:
         self.path, self.wanted, self.decimal, self.markers = path, wanted, decimal, markers

@@ -26,7 +26,7 @@ MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
 
 @runtime_checkable
 class ChainLike(Protocol):
-    """What tables need of a robot: the names and kinds of its joints, in order."""
+    """Names and kinds of a robot's joints, in order: all that tables need of it."""
 
     @property
     def joint_names(self) -> Sequence[str]:

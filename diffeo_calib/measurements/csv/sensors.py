@@ -58,7 +58,7 @@ class SensorColumns(Protocol):
 
     @property
     def word(self) -> str:
-        """What a row of this kind holds, such as "a position"."""
+        """Name of the contents of a row, such as "a position"."""
         ...
 
     def filled(self, rows: FileRows) -> Tensor:

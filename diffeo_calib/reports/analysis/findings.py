@@ -38,11 +38,11 @@ from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 LOG = logging.getLogger(__name__)
-CALM = 1.0
+UNMOVED_MEDIAN_DEVIATIONS = 1.0
 """Median error in claimed deviations below which nothing can have moved."""
 STEPS = 4
 """Of the analysis, as they are told."""
-PROBES = 60
+PROBE_CONFIGURATIONS = 60
 """Configurations at which the share of the markers in the expected variance is judged."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
@@ -87,7 +87,7 @@ class Findings:
         """Share of the expected variance that knowing the markers would remove."""
         geometry = self.model.nominal.geometry
         tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-        return self.rows.map.explained_by(tool, self.expected.q[:PROBES])
+        return self.rows.map.explained_by(tool, self.expected.q[:PROBE_CONFIGURATIONS])
 
     rms_of = "of these rows"
 
@@ -247,7 +247,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
-    large = predictions.errors.median > CALM * float(predictions.claimed.nanmedian())
+    large = predictions.errors.median > UNMOVED_MEDIAN_DEVIATIONS * float(predictions.claimed.nanmedian())
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
     if data.bodies.perhaps_moved(far=large):

@@ -56,7 +56,7 @@ OPEN_SHARE = 0.8
 """Share of the prior deviation above which a correction is open."""
 MOST_POINTS = 600
 """Places of the scene."""
-DIGITS = 5
+SCENE_DECIMALS = 5
 """Decimals of a length in m that a scene needs: 10 um at 1 m."""
 
 
@@ -169,9 +169,9 @@ def _scene(found: Findings) -> Scene:
     *before, (last, _) = found.stages.items()
     for name, kinematics in before:
         predicted = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
-        errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)
-    errors[last] = listed(seen.away[there][::step], DIGITS + 2)
-    return Scene(listed(seen.measured[there][::step], DIGITS), errors)
+        errors[name] = listed((seen.measured - predicted)[there][::step], SCENE_DECIMALS + 2)
+    errors[last] = listed(seen.away[there][::step], SCENE_DECIMALS + 2)
+    return Scene(listed(seen.measured[there][::step], SCENE_DECIMALS), errors)
 
 
 def why(found: Findings) -> Section:
@@ -225,7 +225,7 @@ def _correction(value: float, deviation: float, prior: float) -> str:
     return f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}"
 
 
-LARGEST = 5
+LISTED_ROWS = 5
 """Rows with the largest errors that are listed."""
 MOST_OUTLIERS = 20
 """Rows that look wrong that are listed."""
@@ -285,7 +285,7 @@ def _largest(found: Findings) -> Table:
     """The rows with the largest errors, beside what the model expects there."""
     seen, robot = found.predictions, found.model.robot
     errors, body = seen.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
-    order = errors.argsort(descending=True)[:LARGEST].tolist()
+    order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
     joints = joint_values_by_row(robot, seen.data.q[order])
     lines = [
         ["error [mm]", *(millimetres(float(errors[row])) for row in order)],

@@ -13,11 +13,11 @@ from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
 
-ENOUGH = 1.1
+WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
 FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
-BLAMED = 0.5
+BLAMED_VARIANCE_SHARE = 0.5
 """Share of the expected variance that knowing the markers would remove, from which they are blamed."""
 OPEN_M = 1e-3
 """Deviation of a marker, m, in a direction that the rows leave open, from which it is blamed."""
@@ -27,7 +27,7 @@ BAD_RATIO = 1.5
 """Ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named."""
 
 
-CHANCE = 0.05
+MISCALIBRATION_PROBABILITY = 0.05
 """Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""
 
 
@@ -94,7 +94,7 @@ def advice(found: Findings) -> Iterator[str]:
         return
     rows, error = found.forecast
     now = found.learning_curve[-1][1]
-    if now > ENOUGH * error:
+    if now > WORTHWHILE_ERROR_FACTOR * error:
         yield (
             f"Twice as many poses ({rows}) would bring about {1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm; "
             "the poses that help most are listed under Where."
@@ -107,7 +107,7 @@ def advice(found: Findings) -> Iterator[str]:
 def _unless_planned(found: Findings) -> str:
     """That planned poses help where more of the same do not, if they do."""
     now, then = (float(found.expected.next.expected_rms[count]) for count in (0, -1))
-    if now < ENOUGH * then:
+    if now < WORTHWHILE_ERROR_FACTOR * then:
         return ""
     lower = f"from {rough_millimetres(now)} to {rough_millimetres(then)} mm"
     return f"; those listed under Where lower the error expected anywhere in the joint ranges {lower}"
@@ -125,7 +125,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     number, axis = divmod(int(variances.argmax()), 3)
     far = rough_millimetres(expected.error.whole)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
-    if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
+    if found.share_of_tool > BLAMED_VARIANCE_SHARE or bool((open_directions.abs() > OPEN_M).any()):
         what = model.bodies.name(number, len(found.rows.on))
         along = f"along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
@@ -171,7 +171,7 @@ def worst_range(found: Findings) -> Iterator[str]:
 def judged(found: Findings) -> str:
     """Whether the claimed regions can be believed, as far as the number of rows tells."""
     inside, count = found.predictions.inside()
-    low, high = binomial_band(count, 0.95, CHANCE)
+    low, high = binomial_band(count, 0.95, MISCALIBRATION_PROBABILITY)
     if inside < low:
         what = "these are too small: widen the model's deviations, or measure more poses like these"
     elif inside > high:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 POINTS = 120
 """Values of a joint at which its transmission error is drawn."""
-BINS = 24
+HISTOGRAM_BINS = 24
 """Intervals of the measured values below it."""
 WIDE_RATIO = 20.0
 """Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
@@ -62,7 +62,7 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     axes.fill_between(x, error - band, error + band, color=BLUE, alpha=0.2, lw=0)
     axes.plot(x, error, color=BLUE, lw=1.8)
     most = max(float((error.abs() + band).max()), 1e-6)
-    counts, edges = np.histogram(joint_values(robot, joint, measured), BINS)
+    counts, edges = np.histogram(joint_values(robot, joint, measured), HISTOGRAM_BINS)
     heights, bottom = 0.5 * most * counts / counts.max(), -1.75 * most
     axes.stairs(bottom + heights, edges, baseline=bottom, fill=True, color=GREY, alpha=0.6, lw=0)
     axes.set_ylim(-1.75 * most, 1.15 * most)
