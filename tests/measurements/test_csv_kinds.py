@@ -242,6 +242,17 @@ def test_read_readings_names_its_columns_and_units(tmp_path: Path) -> None:
             dc.read_readings(path, NAMES, names, **{"kind": kind}, **units, **options)
 
 
+def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:
+    """As a program writes a table of numbers and names."""
+    (tmp_path / "t.csv").write_text("a,b,x,y,z,s\n0,1,1,2,3,nan\n1,2,nan,nan,nan,p\n2,2,NaN,NaN,NaN,p\n")
+    known: dict[str, Any] = {"length": "m", "angle": "rad"}
+    found = read_measurements(tmp_path / "t.csv", NAMES, list("xyz"), socket="s", **known)
+    assert found.row_sockets == ["", "p", "p"]
+    (tmp_path / "t.csv").write_text("a,b,s\n0,1,p\n1,2,nan\n2,2,p\n")
+    with pytest.raises(MeasurementError, match=r"line 3, column 's'.*name"):
+        read_measurements(tmp_path / "t.csv", NAMES, socket="s", **known)
+
+
 def test_poses_beside_sockets_and_payloads(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("a,b,x,y,z,rx,ry,rz,s,kg\n0,1,1,2,3,0,0,1,,1\n1,2,,,,,,,p,2\n")
     turned: dict[str, Any] = {"rotation": ["rx", "ry", "rz"], "convention": "rotvec", "rotation_angle": "rad"}

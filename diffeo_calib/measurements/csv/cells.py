@@ -260,7 +260,7 @@ class TextCells:
         expected: str = "a name",
         fix: str = "fill it in",
     ) -> list[str]:
-        """The cells of one column in these lines, as text without blanks around it.
+        """The cells of one column in these lines, as text without blanks around it; "nan" is an empty cell.
 
         Args:
             column: its name. lines: numbers of the lines.
@@ -276,6 +276,7 @@ class TextCells:
             raise MeasurementError.of(what, expected="one column of this name", got=got, fix=fix)
         place = names.index(column)
         texts = [cells[line][place].strip() for line in lines]
+        texts = ["" if text.lower() == "nan" else text for text in texts]  # as programs write what is missing
         if "" in texts and not empty:
             bad = BadCells()
             for line, text in zip(lines, texts, strict=True):
