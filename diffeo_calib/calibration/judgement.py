@@ -230,7 +230,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
         return Judgement(causes)
     wrong = contradicted(model, some)
     block = block_text(model, some, wrong)
-    causes = [block] if block is not None else _larger_than_expected(model, seen, found.positions) * (not wrong)
+    causes = [block] if block is not None else larger_than_expected(model, seen, found.positions) * (not wrong)
     return Judgement(causes, wrong, len(some))
 
 
@@ -252,7 +252,7 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
 
 
-def _larger_than_expected(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> list[str]:
+def larger_than_expected(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> list[str]:
     """A sentence about errors above twice the expected ones."""
     expected = expected_rms(model, data, errors.errors.shape[1])
     if errors.rms < LARGE_PER_EXPECTED * expected:

@@ -181,6 +181,13 @@ def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.F
     assert len(found.next) == 5
 
 
+def test_errors_larger_than_expected_are_named(arm: Case) -> None:
+    points = arm.test.points + 1.5e-4 * torch.randn(arm.test.points.shape, generator=torch.Generator().manual_seed(1))
+    found = find(arm.model, dc.Measurements(arm.test.q, points))
+    assert any("times as large as the model expects" in text for text in advice(found)), list(advice(found))
+    assert not any("times as large" in text for text in advice(find(arm.model, arm.test)))
+
+
 def test_outliers_and_moved_markers_are_named(arm: Case) -> None:
     test = arm.test[:60]
     points = test.points.clone()

@@ -14,7 +14,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.findings import Outlier, Part, parts
-from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
+from diffeo_calib.calibration.judgement import block_text, larger_than_expected, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -243,7 +243,7 @@ def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | No
 
 
 def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequence[Outlier]) -> list[str]:
-    """Sentences about devices or markers that moved, and about blocks of wrong rows."""
+    """Sentences about devices or markers that moved, blocks of wrong rows, and errors larger than expected."""
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
@@ -259,6 +259,8 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
         raise MeasurementError(" ".join([*(named or [text or ""]), data.set_up_hint]).strip())
     if not named:
         named = [text or block_text(model, data, list(outliers)) or ""]
+    if not any(named) and not outliers and not predictions.left_out:
+        named = larger_than_expected(model, data, predictions.errors)
     return [text for text in named if text]
 
 
