@@ -23,7 +23,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
 
-from diffeo_calib.cli.console import EXIT_INTERRUPTED
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, say, show_error
 from diffeo_calib.common.errors import InputError, as_written
 
 if sys.version_info >= (3, 11):
@@ -236,7 +236,7 @@ def run(fleet: Fleet) -> int:
             signal.signal(number, handler)
     count = len(fleet.campaigns)
     if stops:
-        print("error: interrupted; campaigns that had begun keep what their output names.", file=sys.stderr)
+        show_error("interrupted; campaigns that had begun keep what their output names.")
         return EXIT_INTERRUPTED
-    print(f"{count - len(failed)} of {count} campaigns done" + (f"; failed: {', '.join(failed)}" if failed else ""))
+    say(f"{count - len(failed)} of {count} campaigns done" + (f"; failed: {', '.join(failed)}" if failed else ""))
     return min(len(failed), MOST_FAILED)

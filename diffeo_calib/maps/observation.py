@@ -189,7 +189,7 @@ class CameraPoints(Observation):
         return (self.poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + self.poses[:, :3, 3]
 
     def _in_front(self, points: Tensor) -> Tensor:
-        """The same, none of them behind its camera."""
+        """Points in the camera's frame (N, 3), m; InputError if one of them is behind its camera."""
         seen = self._seen(points)
         behind = (seen[:, 2] < SMALLEST_DISTANCE_M).nonzero()[:, 0]
         if len(behind):
