@@ -261,6 +261,13 @@ def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:
     return found.outliers
 
 
+@pytest.mark.parametrize("name", ["camera on the tool", "two cameras", "images of a board", "images and a tracker"])
+@pytest.mark.parametrize("which", ["new", "moved"])
+def test_no_clean_row_contradicts_the_others(which: str, name: str) -> None:
+    kind = kind_named(name)
+    assert wrong_rows(kind.model, getattr(kind, which)) == ()
+
+
 @pytest.mark.parametrize("name", ["camera on the tool", "two cameras"])
 def test_a_row_that_contradicts_all_others_is_named_and_no_other(name: str) -> None:
     """Rows of cameras differ in their noise, and images share the errors of a lens."""
@@ -276,3 +283,15 @@ def test_two_rows_that_were_exchanged_are_named() -> None:
     q = kind.new.q.clone()
     q[[0, 3]] = q[[3, 0]]
     assert set(wrong_rows(kind.model, with_attributes(kind.new, q=q), free="base")) == {0, 3}
+
+
+def test_a_lens_that_is_known_poorly_leaves_the_frame_open() -> None:
+    """Errors that images share are not averaged away by more images."""
+    kind = kind_named("images of a board")
+    open_by = []
+    for factor in (1.0, 10.0):
+        rows = with_attributes(kind.new, pose_shared=factor * kind.new.pose_shared)
+        found = kind.model.registered(rows).registration
+        assert found is not None
+        open_by.append(found.covariance[:3, :3].trace())
+    assert open_by[1] > 4 * open_by[0]

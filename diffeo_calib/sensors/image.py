@@ -23,9 +23,6 @@ from diffeo_calib.sensors.devices import (
 VIEW_HALF_ANGLE_RAD = 0.5
 """Of the field of view of a camera whose poses are planned: 57 degrees in all."""
 
-NEAREST_SHARE = 1.2
-"""Least depth of the middle of the points, as a share of the largest distance of a point from it."""
-
 
 @dataclass(frozen=True, eq=False)
 class Cameras(Devices):
@@ -161,5 +158,4 @@ def _by_parallel_rays(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
     rows = torch.linalg.lstsq(at, values - middle, driver="gelsd").solution.mT  # (2, 3)
     scale = torch.linalg.svdvals(rows).mean().clamp(min=SMALLEST_M)
     R = nearest_rotations(torch.cat([rows / scale, torch.linalg.cross(rows[0], rows[1])[None] / scale**2]))
-    depth = torch.maximum(1 / scale, NEAREST_SHARE * at.norm(dim=1).max())
-    return R, depth * torch.cat([middle, torch.ones_like(middle[:1])])
+    return R, torch.cat([middle, torch.ones_like(middle[:1])]) / scale

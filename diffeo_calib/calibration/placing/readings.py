@@ -411,21 +411,13 @@ def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor
         return torch.cat([(w * e).flatten() for w, e in zip(weights, rows.errors(*moved(u)), strict=True)])
 
     start = scale.new_zeros(K + sum(sizes))
-    at_start = errors(start)
-
-    def errors_or_nan(u: Tensor) -> Tensor:
-        """NaN where no device can read, such as a camera with the ball behind it: the step is then made shorter."""
-        try:
-            return errors(u)
-        except InputError:
-            return torch.full_like(at_start, torch.nan)
 
     def slopes(u: Tensor) -> Tensor:
         pairs = zip(weights, rows.slopes(*moved(u), free, scale), strict=True)
         return torch.cat([(w[..., None] * s).flatten(0, 1) for w, s in pairs])
 
     loss = "soft_l1" if robust else "linear"
-    found = least_squares_of(errors_or_nan, slopes, start, max_nfev=STARTS_STEPS, loss=loss)
+    found = least_squares_of(errors, slopes, start, max_nfev=STARTS_STEPS, loss=loss)
     theta, there = moved(found.u)
     left = rows.errors(theta, there)
     parts = zip(found.leverage.split([e.numel() for e in left]), left, strict=True)
