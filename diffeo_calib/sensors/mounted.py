@@ -258,8 +258,8 @@ def mounted_of(model: Any) -> Mounted:
     sets = [own for own in model.placement if own.kind == kind.kind]
     names = tuple(name for own in sets for name in own.names)
     none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
-    found = (torch.cat([getattr(own, k) for own in sets] or [none]) for k in ("constants", "deviations"))
-    return kind(names, *found, model.turns)
+    found = [torch.cat([getattr(own, k) for own in sets] or [none]) for k in ("constants", "deviations")]
+    return kind(names, found[0], found[1], model.turns)
 
 
 def own_slopes(points: Tensor) -> Tensor:
