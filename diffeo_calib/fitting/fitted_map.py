@@ -28,8 +28,9 @@ from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100
 """Number of configurations that are linearised together for their covariances."""
-OPEN_TURN_RAD = 0.2
-"""Prior standard deviation from which a turn of all points is open."""
+OPEN_TURN_RAD = 1.0
+"""Prior standard deviation from which a turn of all points is open: between that of a base that was found, 0.1, which a
+changed robot widens by up to ten, and that of an open one, 2."""
 NEGLIGIBLE_TURN_RAD = 0.01
 """Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
 

@@ -108,6 +108,13 @@ def test_rows_of_the_model_itself_change_nothing(arm: Case) -> None:
     assert before > 0.1
 
 
+def test_regions_of_a_changed_robot_are_widened_once(arm: Case) -> None:
+    """Variances by a factor of 50: a base that was found is no open one by that."""
+    fitted, q = arm.model.map, arm.test.q[:5]
+    widened = fitted.inflated(50.0).predict(q, noise=False)[1]
+    torch.testing.assert_close(widened, 50 * fitted.predict(q, noise=False)[1], rtol=1e-6, atol=0.0)
+
+
 @pytest.mark.parametrize("free", ["both", "base"])
 def test_a_moved_tracker(arm: Case, free: str) -> None:
     T = transform(5)
