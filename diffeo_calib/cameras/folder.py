@@ -102,8 +102,9 @@ def read_folders(
 
     Args:
         folders: of the images, one of each camera.
-        joints: a table with a header; its column `image` names the file of each row, in every folder that has one;
-            without this column the rows are those of the files of each folder in alphabetical order.
+        joints: a table with a header; its column `image`, or another one of file names of images, names the file of
+            each row, in every folder that has one; without it the rows are those of the files of each folder in
+            alphabetical order.
         board: to look for. sep: between cells. progress: called as ``progress(task, done, total)``.
 
     Raises:
@@ -165,8 +166,8 @@ def _files(
     folders: Sequence[Path], joints: Path, header: list[str], rows: list[list[str]]
 ) -> tuple[list[str], list[list[str]], list[list[str | None]]]:
     """Header and cells without the column of images, and the file of each row in every folder."""
-    if IMAGE in header:
-        place = header.index(IMAGE)
+    place = _column_of_images(header, rows)
+    if place is not None:
         names = [row[place].strip() for row in rows]
         files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
         missing = [name for name, *own in zip(names, *files, strict=True) if not any(own)]
@@ -184,6 +185,14 @@ def _files(
             raise MeasurementError.of(what, expected="an image for each row", got=got, fix=fix)
         found.append([*own])
     return header, rows, found
+
+
+def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:
+    """The column `image`, else the first one whose cells all have the suffix of an image."""
+    if IMAGE in header:
+        return header.index(IMAGE)
+    named = (k for k in range(len(header)) if all(Path(row[k].strip()).suffix.lower() in SUFFIXES for row in rows))
+    return next(named, None)
 
 
 def _grey(path: Path) -> np.ndarray | None:

@@ -5,8 +5,8 @@
     position = ["x,y,z"]                length = "mm"
     angle = "deg"                       output = "robot.safetensors"
 
-`diffeo-calib fit campaign.toml` runs as if the options had been typed; options that are typed as well come last and
-win. Paths are relative to the folder of the file.
+`diffeo-calib fit campaign.toml` runs as if the options had been typed. Options that are typed as well win,
+also those that may be repeated, such as `--tip`. Paths are relative to the folder of the file.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ def expanded(arguments: Sequence[str], known: Sequence[str], live: Sequence[str]
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")
     if "csv" not in names:
         raise InputError.of(f"{path} has no entry csv", fix='add csv = "measurements.csv", the table to calibrate with')
-    options = [word for name, value in zip(names, entries.values(), strict=True) for word in _words(path, name, value)]
+    typed = {word.removeprefix("--").partition("=")[0] for word in words[at + 2 :] if word.startswith("--")}
+    kept = {name: value for name, value in zip(names, entries.values(), strict=True) if name not in typed}
+    options = [word for name, value in kept.items() for word in _words(path, name, value)]
     return [*words[: at + 1], _text(path, "csv", entries["csv"]), *options, *words[at + 2 :]]
 
 

@@ -180,7 +180,7 @@ def images_command(
         Path,
         typer.Argument(
             metavar="JOINTS",
-            help="Table of joint values; its column `image` names files, else rows are in their order.",
+            help="Table of joint values, with a column of file names unless rows are in their order.",
         ),
     ],
     given: options.BoardImages,

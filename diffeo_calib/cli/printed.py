@@ -105,17 +105,20 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
-def placement_lines(geometry: Geometry, *, poses: bool, ball: bool = False) -> Iterator[str]:
+def placement_lines(
+    geometry: Geometry, *, poses: bool, ball: bool = False, frame: str = "the measuring frame"
+) -> Iterator[str]:
     """Where the robot's base was found in the measuring frame, and the markers in their tips' frames.
 
     Args:
         geometry: as refined with the deformations.
         poses: whether the markers are the points of measured frames, three of each.
         ball: whether the last one of several is a ball that rested in sockets.
+        frame: of the base, in words.
     """
     base = geometry.base
     place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
-    yield f"robot base in the measuring frame: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
+    yield f"robot base in {frame}: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
     markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
     for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1 + ball)

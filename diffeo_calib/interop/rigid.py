@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 
+RANGE_ROWS = 200
+"""Least number of configurations in the joint ranges of rows that show no positions."""
 GEOMETRIC, PROJECTION = "geometric calibration", "projection of the model"
 FOLDS = 5
 """Of the cross-validation."""
@@ -54,7 +57,7 @@ class RigidKinematics:
     Args:
         geometry: chain, joint errors, base in the measuring frame and markers.
         how: what they are, in words.
-        rms: root mean square distance of the markers from the model's at the measured configurations, m.
+        rms: root mean square distance of the markers from the model's at the configurations that are compared, m.
         largest: largest such distance, m.
         validated: name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold
             cross-validation; the geometric calibration had seen the measurements of all of them).
@@ -94,29 +97,29 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
         and so do its rigid kinematics. Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, one to two
         seconds for 400 configurations.
     """
-    x, y = _predictions(model, transmission=transmission)
-    found = _project(model, x, y)
+    on = Compared.of(model, transmission=transmission)
+    found = _project(model, on.x, on.y)
     candidates = {PROJECTION: found.geometry}
     if model.rigid_errors is not None and not transmission:
-        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, x, y)
-    validated = _validate(model, candidates, found, x, y)
+        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, on.x, on.y)
+    validated = _validate(model, candidates, found, on)
     how = min(validated, key=lambda name: validated[name])
-    return _compared(candidates[how], how, x, y, validated)
+    return _compared(candidates[how], how, on, validated)
 
 
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
-    x, y = _predictions(model, transmission=transmission)
+    on = Compared.of(model, transmission=transmission)
     nominal = Geometry.nominal(model.robot).joint_errors
-    return _compared(_placed(model, nominal, x, y), "nominal kinematics", x, y, {})
+    return _compared(_placed(model, nominal, on.x, on.y), "nominal kinematics", on, {})
 
 
 def geometric_kinematics(model: CalibratedKinematics) -> RigidKinematics:
     """The geometric calibration that the model was fitted from; without one, the projection of the model."""
     if model.rigid_errors is None:
         return rigid_kinematics(model)
-    x, y = _predictions(model)
-    return _compared(_placed(model, model.rigid_errors, x, y), GEOMETRIC, x, y, {})
+    on = Compared.of(model)
+    return _compared(_placed(model, model.rigid_errors, on.x, on.y), GEOMETRIC, on, {})
 
 
 def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
@@ -124,20 +127,21 @@ def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, 
 
     Joint errors are kept; base and markers are those that fit best.
     """
-    x, y = _predictions(model, transmission=applied)
-    return _compared(_placed(model, rigid.geometry.joint_errors, x, y), rigid.how, x, y, {})
+    on = Compared.of(model, transmission=applied)
+    return _compared(_placed(model, rigid.geometry.joint_errors, on.x, on.y), rigid.how, on, {})
 
 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     """The joint offsets that bring the nominal kinematics closest to the model at the measured configurations."""
-    x, y = _predictions(model)
-    start = _placed(model, Geometry.nominal(model.robot).joint_errors, x, y)
-    noise = _noise(start, x, y)
+    on = Compared.of(model)
+    points = on.x, on.y
+    start = _placed(model, Geometry.nominal(model.robot).joint_errors, *points)
+    noise = _noise(start, *points)
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
-        offsets = _fit_offsets(start, x, y, std, noise)
-        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, x, y)
-        noise = _noise(geometry, x, y)
-    return JointOffsets(offsets, _compared(geometry, "joint offsets", x, y, {}))
+        offsets = _fit_offsets(start, *points, std, noise)
+        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, *points)
+        noise = _noise(geometry, *points)
+    return JointOffsets(offsets, _compared(geometry, "joint offsets", on, {}))
 
 
 def distances(geometry: Geometry, x: Tensor, y: Tensor) -> Tensor:
@@ -151,15 +155,38 @@ def joint_motion(model: CalibratedKinematics, q: Tensor) -> Tensor:
     return q + torch.stack(errors, 1)
 
 
-def _predictions(model: CalibratedKinematics, *, transmission: bool = False) -> tuple[Tensor, Tensor]:
-    """Joint values (N, n) for the geometry at the measured configurations without repeats, and the model's points."""
-    q = torch.unique(model.configurations, dim=0)
-    x = joint_motion(model, q) if transmission else q
-    return x.detach().to(HOST), model(q).detach().to(HOST)
+class Compared(NamedTuple):
+    """What rigid kinematics are fitted to and compared with.
+
+    Where nothing measured positions, rows are at a few places, such as sockets, at which kinematics agree that differ
+    elsewhere: there the model's joint ranges take part, too, and distances are those over the ranges.
+
+    Args:
+        x: (N, n) joint values for the geometry, rad or m. y: (N, P, 3) the model's points, m.
+        judged: (N,) boolean, where distances count. where: these configurations, in words.
+    """
+
+    x: Tensor
+    y: Tensor
+    judged: Tensor
+    where: str
+
+    @classmethod
+    def of(cls, model: CalibratedKinematics, *, transmission: bool = False) -> Compared:
+        """The measured configurations of a model without repeats, and more for some."""
+        q = torch.unique(model.configurations, dim=0)
+        judged, where = torch.ones(len(q), dtype=torch.bool, device=q.device), "measured configurations"
+        if model.map.unregistered.workspace is not None:
+            low, high = model.configurations.amin(0), model.configurations.amax(0)
+            draws = torch.rand(max(RANGE_ROWS, len(q)), len(low), dtype=q.dtype, generator=seeded(0), device=HOST)
+            q = torch.cat([q, low + (high - low) * draws.to(q)])
+            judged, where = torch.arange(len(q), device=q.device) >= len(judged), "configurations in the joint ranges"
+        x = joint_motion(model, q) if transmission else q
+        return cls(x.detach().to(HOST), model(q).detach().to(HOST), judged.to(HOST), f"{int(judged.sum())} {where}")
 
 
-def _compared(geometry: Geometry, how: str, x: Tensor, y: Tensor, validated: Mapping[str, float]) -> RigidKinematics:
-    d = distances(geometry, x, y)
+def _compared(geometry: Geometry, how: str, on: Compared, validated: Mapping[str, float]) -> RigidKinematics:
+    d = distances(geometry, on.x[on.judged], on.y[on.judged])
     return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
 
 
@@ -193,9 +220,10 @@ def _placed(model: CalibratedKinematics, joint_errors: Tensor, x: Tensor, y: Ten
 
 
 def _validate(
-    model: CalibratedKinematics, candidates: Mapping[str, Geometry], found: Identification, x: Tensor, y: Tensor
+    model: CalibratedKinematics, candidates: Mapping[str, Geometry], found: Identification, on: Compared
 ) -> dict[str, float]:
     """RMS distance of each candidate from the model at configurations left out of its fit, m."""
+    x, y = on.x, on.y
     fold = torch.randperm(len(x), generator=seeded(0), device=HOST) % FOLDS
     squares: dict[str, list[Tensor]] = {name: [] for name in candidates}
     for out in (fold == k for k in range(min(FOLDS, len(x)))):
@@ -205,7 +233,8 @@ def _validate(
                 fitted = _refit(model, *kept, like=found).geometry
             else:
                 fitted = _placed(model, geometry.joint_errors, *kept)
-            squares[name].append(distances(fitted, x[out], y[out]).square().flatten())
+            own = out & on.judged
+            squares[name].append(distances(fitted, x[own], y[own]).square().flatten())
     return {name: float(torch.cat(parts).mean().sqrt()) for name, parts in squares.items()}
 
 

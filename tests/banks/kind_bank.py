@@ -38,6 +38,7 @@ from diffeo_calib.robots.se3 import twist_transform
 ELSEWHERE = torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64)
 """Where the device stands later: shift in m, turn in rad."""
 UNITS = ("--length", "mm", "--angle", "deg")
+FOLDER = tempfile.TemporaryDirectory(prefix="diffeo_calib_kinds_")  # of all kinds, until this process ends
 Truth = Callable[[Tensor], Tensor]
 """Joint values (N, n) -> true markers (N, P, 3) in the order of the model's, m, in any frame that does not move."""
 
@@ -312,7 +313,9 @@ class Kind:
 @cache
 def kind_named(name: str) -> Kind:
     """The kind, made once."""
-    kind = Kind(name, SOURCES[name](), Path(tempfile.mkdtemp(prefix="kind_")))
+    folder = Path(FOLDER.name) / name.replace(" ", "_")
+    folder.mkdir()
+    kind = Kind(name, SOURCES[name](), folder)
     if name == "several tips":
         kind.urdf.write_text(two_arms_bank.urdf())
     else:

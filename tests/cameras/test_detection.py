@@ -165,6 +165,13 @@ def test_images_without_rows_are_refused(folder: Path) -> None:
         read_folders([folder], table, FOUND)
 
 
+def test_any_column_of_file_names_pairs_rows_with_images(folder: Path) -> None:
+    table = folder / "joints.csv"
+    table.write_text("q1,file\n30,2.png\n10,0.png\n")
+    (found,) = read_folders([folder], table, FOUND)
+    assert [(one.name, one.cells) for one in found.used] == [("2.png", ["30"]), ("0.png", ["10"])]
+
+
 def test_a_dictionary_needs_no_prefix_and_an_unknown_one_is_named() -> None:
     assert len(Board.of("charuco:5x7:0.04:0.03:5X5_100").points) == 24
     with pytest.raises(InputError, match=r"DICT_4X4_100.*got.*4X4_10O"):

@@ -48,7 +48,15 @@ def test_entries_become_options(tmp_path: Path) -> None:
     words = expanded(["fit", campaign(tmp_path, text), "--holdout", "0"], KNOWN)
     table = [str(tmp_path / "a.csv"), "--robot", str(tmp_path / "r.urdf")]
     markers = ["--position", "x,y,z", "--position", "u,v,w", "--joints", "q1,q2"]
-    assert words == ["fit", *table, *markers, "--holdout", "0.2", "--holdout", "0"]
+    assert words == ["fit", *table, *markers, "--holdout", "0"]
+
+
+@pytest.mark.parametrize("typed", [["--tip", "flange"], ["--tip=flange"]])
+def test_typed_options_replace_those_of_the_file(tmp_path: Path, typed: list[str]) -> None:
+    """A tip beside those of the file would be another arm."""
+    text = 'csv = "a.csv"\ntip = ["one", "two"]\nholdout = 0.2\n'
+    words = expanded(["fit", campaign(tmp_path, text), *typed], [*KNOWN, "tip"])
+    assert words[2:] == ["--holdout", "0.2", *typed]
 
 
 @pytest.mark.parametrize("words", [["fit", "a.csv"], ["evaluate", "a.toml"], ["fit"], []])

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from export_bank import rigid_model, wrong
+from kind_bank import kind_named
 from model_file_bank import Editor, refused, set_entry, set_tensor
 from product_bank import Case
 from torch import Tensor
@@ -172,6 +173,17 @@ def test_damaged_entries_are_refused(editor: Editor) -> None:
     for change in (lambda t: t[:2], lambda t: 2 * t, lambda t: t * float("nan")):
         assert "joint_errors" in refused(editor.write(set_tensor("rigid_errors", change)))
     assert dc.load(editor.write(set_tensor("rigid_errors", lambda _: None))).rigid_errors is None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ball in sockets", "distances"])
+def test_distances_hold_where_no_row_is(name: str) -> None:
+    """Rows in sockets and at one wire show little of the robot: what is said is of the joint ranges."""
+    model = kind_named(name).model
+    low, high = model.configurations.amin(0), model.configurations.amax(0)
+    q = low + (high - low) * torch.rand(400, len(low), dtype=low.dtype, generator=torch.Generator().manual_seed(5))
+    found = rigid_kinematics(model)
+    assert rms(found.geometry.points(q), model(q).detach()) == pytest.approx(found.validated[found.how], rel=0.15)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from diffeo_calib.interop.files import in_unit, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
 from diffeo_calib.interop.mjcf import mjcf_text
 from diffeo_calib.interop.rigid import (
+    Compared,
     RigidKinematics,
     applied_with_tables,
     best_joint_offsets,
@@ -134,10 +135,10 @@ class _Export:
         said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in found.validated.items())
         self.lines.append(f"rigid kinematics from the {found.how} (cross-validated: {said})")
         self.lines.append("rigid kinematics hold no gravity sag, no transmission errors and no other deformations")
-        self.lines += [
-            f"  their {line}" for line in placement_lines(found.geometry, poses=self.model.lever is not None)
-        ]
-        self.lines.append("  (base and markers belong to these kinematics: do not mix them with those of the model)")
+        frame = "that of the model" if stands_free(self.model) else "the measuring frame"
+        placed = placement_lines(found.geometry, poses=self.model.lever is not None, frame=frame)
+        self.lines += [f"  their {line}" for line in placed]
+        self.lines.append("  (they belong to these files: plan with them or send commands of `correct`, never both)")
         for option in options:
             self.files[option] = self._text(option, found.geometry, urdf).encode("utf-8", "surrogateescape")
 
@@ -241,7 +242,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
     if about is None or stands_free(model):  # no position was measured
         about, new = ExpectedError.of(model).whole, "true positions, about"
-    title = f"Distance from the model over its {len(model.configurations)} measured configurations, mm"
+    title = f"Distance from the model over {Compared.of(model).where}, mm"
     table = Table(title=title, title_justify="left")
     table.add_column("export")
     for column in ("RMS", "max", "cross-validated", *([new] if about is not None else [])):
