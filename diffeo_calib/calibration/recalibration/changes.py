@@ -338,20 +338,15 @@ class Changes:
         return bool(self.probabilities)
 
     @property
-    def _few(self) -> str:
+    def few(self) -> str:
+        """How many rows could be tested, in words."""
         return f"only {self.rows} rows lie within the joint ranges that the model knows"
-
-    def warn_if_untested(self) -> None:
-        """Warn if a test was wanted, and too few rows allow one."""
-        if self.level is not None and not self.tested:
-            what = f"{self._few}: changes of the robot were not tested, and the places that were found may hide one"
-            warn_user(sentence(what, fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
 
     def __str__(self) -> str:
         if self.level is None:
             return "changes of the robot were not tested"
         if not self.tested:
-            return f"{self._few}: changes were not tested, and what has changed is not known"
+            return f"{self.few}: changes were not tested, and what has changed is not known"
         if not self.found:
             places = "the places of device and markers, which may hide an offset of the first or the last joint"
             rows = f", {self.rows} rows" * bool(self.rows)
@@ -380,8 +375,14 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
 
     Returns:
         what was found, and what may drift: nothing where only a part of the rows shows a change.
+
+    Warns:
+        DiffeoCalibWarning: too few rows within the old joint ranges for a test.
     """
     changes, drifts = _changes_of(rows, level=level, seed=seed)
+    if not changes.tested:
+        what = f"{changes.few}: changes of the robot were not tested, and the places that were found may hide one"
+        warn_user(sentence(what, fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
     groups = groups_of(rows)
     if changes.found or not groups:
         return changes, drifts

@@ -171,7 +171,6 @@ def compare(
     before = place_again(model, other, marker)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
-    changes.warn_if_untested()
     found = before.registration
     if found is not None:
         warn_about(found, outliers=not changes.found, excess=not changes.found)

@@ -168,7 +168,6 @@ def recalibrate(
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
     LOG.info("changes: %s", changes)
-    changes.warn_if_untested()
     warn_of_groups(changes)
     found = before.registration
     if found is not None:
