@@ -274,6 +274,7 @@ def _(bench: Bench) -> None:
         if kind.name not in (
             "images of a board",
             "two cameras",
+            "two cameras on the tool",
             "images and a tracker",
         ):  # whose poses follow from all corners of a table
             assert entry["rms"] == pytest.approx(one.shown[1] * one.rms, rel=1e-3)

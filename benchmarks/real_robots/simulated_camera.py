@@ -21,6 +21,8 @@ BOARD = (0.55, 0.1, 0.05)
 """Place of the board in the arm's base, m."""
 CAMERA = (0.06, 0.01, 0.04, 0.1, -0.2, 0.3)
 """Place of the camera in the flange, m, and its rotation vector, rad."""
+CAMERA_BESIDE = (-0.09, 0.03, 0.02, -0.15, 0.3, 1.7)
+"""The same of a second camera on the flange."""
 FIXED_CAMERA = (1.0, 0.3, 0.7), (0.5, 0.0, 0.35)
 """Place of a fixed camera in the arm's base, and where it looks, m."""
 SECOND_CAMERA = (0.5, -0.75, 0.6), (0.5, 0.0, 0.35)
@@ -105,16 +107,16 @@ def seen_corners(boards: Tensor, noise_px: float, seed: int = 7, camera: Camera 
     return found.masked_fill(outside[..., None], torch.nan)
 
 
-def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None) -> CameraArm:
+def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *, second: bool = False) -> CameraArm:
     """An arm whose camera sees the board in random configurations; the print as of :func:`true_camera`."""
     arm = SimulatedArm(seed=seed, markers=3)
-    given = torch.tensor(CAMERA, dtype=torch.float64, device=HOST)
+    given = torch.tensor(CAMERA_BESIDE if second else CAMERA, dtype=torch.float64, device=HOST)
     camera = transforms(rotation(given[None, 3:]), given[None, :3])
     base = torch.eye(4, dtype=torch.float64, device=HOST)
     base[:3, 3] = -torch.tensor(BOARD, dtype=torch.float64, device=HOST)
     arm.truth = replace(arm.truth, base=base, tool=mark_points(camera, LEVER)[0])
     seen_boards = _seen(arm, rows, seed, lambda points: inverse_poses(poses_from_marks(points, LEVER)))
-    return CameraArm(arm, *seen_boards, true_camera(print_seed))
+    return CameraArm(arm, *seen_boards, true_camera(print_seed, SECOND_LENS if second else LENS))
 
 
 def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *, second: bool = False) -> CameraArm:
@@ -134,14 +136,16 @@ def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *,
     return CameraArm(arm, *seen_boards, true_camera(print_seed, SECOND_LENS if second else LENS))
 
 
-def images_of_both(arms: Sequence[CameraArm], rows: Sequence[int], noise_px: float, seed: int = 7) -> dc.Measurements:
-    """The first images of two cameras, "left" and "right", that stand and see the board on the same arm, in turn."""
+def images_of_both(
+    arms: Sequence[CameraArm], rows: Sequence[int], noise_px: float, seed: int = 7, *, on_tool: bool = False
+) -> dc.Measurements:
+    """The first images of two cameras, "left" and "right", of the same arm and board, in turn: on the tool, or not."""
     names = arms[0].arm.nominal.joint_names
     q, corners = zip(*(arm.shown(noise_px, seed + k) for k, arm in enumerate(arms)), strict=True)
     order = torch.cat([torch.arange(count, device=HOST) for count in rows]).argsort(stable=True)
     q, corners = (torch.cat([own[:n] for own, n in zip(each, rows, strict=True)])[order] for each in (q, corners))
     cameras = [name for name, count in zip(("left", "right"), rows, strict=True) for _ in range(count)]
-    known = {"board": BOARD_PRIOR, "camera_on_tool": False, "seen_by": [cameras[k] for k in order.tolist()]}
+    known = {"board": BOARD_PRIOR, "camera_on_tool": on_tool, "seen_by": [cameras[k] for k in order.tolist()]}
     return dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), names, **known)
 
 

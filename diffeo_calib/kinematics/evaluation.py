@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, outside_inference_mode
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
@@ -28,7 +28,8 @@ from diffeo_calib.sensors.coordinates import Beside, check_joint_order, check_pa
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import MOUNTING, SESSION, MountedMarkers, Places, sensor_key
+from diffeo_calib.sensors.mounted import mounted_of
+from diffeo_calib.sensors.places import SESSION, Places, sensor_key
 from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -123,7 +124,7 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
     unplaced = model is not None and model.map.workspace is not None and model.registration is None
     points = partial(_predicted, kinematics)
-    known = devices_of(kinematics), session_frames(kinematics), None if model is None else mounted_markers(model)
+    known = devices_of(kinematics), session_frames(kinematics), None if model is None else mounted_of(model)
     beside = Beside(points, *known, unplaced=unplaced, every_session=every_session)
     parts = rows_of_one_kind(data)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
@@ -150,16 +151,6 @@ def session_frames(model: object) -> dict[str, Tensor]:
     """Name of every set-up of positions that a model knows -> (4, 4) transform from its own frame to that one, m."""
     sets = [own for own in getattr(model, "placement", None) or () if getattr(own, "kind", None) == SESSION]
     return {name: T.view(4, 4) for own in sets for name, T in zip(own.names, own.constants, strict=True)}
-
-
-def mounted_markers(model: CalibratedKinematics) -> MountedMarkers:
-    """The markers of every set-up that a model knows, of rows whose markers were mounted anew."""
-    sets = [own for own in model.placement if own.kind == MOUNTING]
-    names = tuple(name for own in sets for name in own.names)
-    none = torch.zeros(0, 0, 3, dtype=torch.float64, device=HOST)
-    values = [[getattr(own, k).unflatten(1, (-1, 3)) for own in sets] for k in ("constants", "deviations")]
-    shifts, deviations = (torch.cat(each) if each else none for each in values)
-    return MountedMarkers(names, shifts, deviations, model.turns)
 
 
 def placement_sentences(model: object) -> list[str]:

@@ -24,7 +24,8 @@ from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.sensors.places import NUMBERS_OF_A_FRAME, SESSION
+from diffeo_calib.sensors.mounted import own_slopes
+from diffeo_calib.sensors.places import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS
 
 RIGID_MOTION_SHARE = 0.01
 """Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""
@@ -98,15 +99,21 @@ class HandEye:
         if model.registration is not None:
             raise InputError.of("the hand-eye transform", expected="a model in the place of its fit")
         geometry = geometry or model.geometry
-        carried = poses_from_marks(geometry.tool[None], lever)
-        to_pose = pose_directions(carried, lever)[0]  # (6, 9)
-        known = to_pose @ _covariance(fitted, geometry.slices["tool"]) @ to_pose.mT
-        frame = SessionFrame.of(model, camera)
-        standing = inverse_poses((frame.transform @ geometry.base)[None])[0]
+        set_up, tool = SetUp.of(model, camera), poses_from_marks(geometry.tool[None], lever)
+        carried = tool @ set_up.mount
+        to_pose = pose_directions(tool, lever)[0]  # (6, 9)
+        there = torch.eye(6, dtype=to_pose.dtype, device=to_pose.device)  # from the model's tool
+        there[:3, 3:] = -skew((carried - tool)[0, :3, 3])
+        to_pose = there @ to_pose
+        known = to_pose @ _covariance(fitted, geometry.slices["tool"], set_up.on_tool(geometry.tool)) @ to_pose.mT
+        if set_up.mount_std is not None:
+            own = there @ torch.block_diag(*[tool[0, :3, :3]] * 2) * set_up.mount_std
+            known = known + own @ own.mT
+        standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
         moved = -torch.eye(6, dtype=standing.dtype, device=standing.device)
         moved[:3, 3:] = skew(standing[:3, 3])
-        found = moved @ _covariance(fitted, geometry.slices["base"], frame.seen_from(geometry.base)) @ moved.mT
+        found = moved @ _covariance(fitted, geometry.slices["base"], set_up.seen_from(geometry.base)) @ moved.mT
         tip, base = geometry.on[0], model.robot.base
         carried_there = Fixed(KnownPose(carried[0], known), tip, f"in the frame of '{tip}'", "in_tip")
         standing_there = Fixed(KnownPose(standing, found), base, "in the robot's base", "in_base")
@@ -121,7 +128,7 @@ class HandEye:
         known = {"camera_on_tool": camera_on_tool, "geometry": geometry}
         if len(cameras) == 1:
             return {cameras[0]: cls.of(model, **known)}
-        sessions = [name for own in model.placement if own.kind == SESSION for name in own.names]
+        sessions = [name for own in model.placement if own.kind in TRANSFORMS for name in own.names]
         return {name: cls.of(model, camera=name, **known) for name in sessions}
 
     def entry(self) -> dict[str, object]:
@@ -143,54 +150,95 @@ def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
     yield from (line for own in [*found.values()][:1] for line in own.board.known.sentences(f"board {own.board.where}"))
 
 
-class SessionFrame(NamedTuple):
-    """The measuring frame of a session.
+class SetUp(NamedTuple):
+    """A set-up of a model: where it measured, and what was on the tool.
 
     Args:
-        transform: (4, 4) from the model's, m. columns: (c,) boolean, the shifts of the fit that move it; twists: (6, k)
-            shift and turn of points about the model's origin, m and rad, by each of them. None for the model's frame.
+        transform: (4, 4) from the model's measuring frame to its own, m. mount: (4, 4) from what it had on the tool to
+            that of the model, m.
+        columns: (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's.
+        frame_twists: (6, k) shift and turn of the measuring frame about the model's origin, m and rad, by each of them;
+            mount_twists: (6, k) of what is on the tool, along the axes of the model's tool.
+        mount_std: (6,) deviations of the same where no row of the fit tells of them.
     """
 
     transform: Tensor
+    mount: Tensor
     columns: Tensor | None = None
-    twists: Tensor | None = None
+    frame_twists: Tensor | None = None
+    mount_twists: Tensor | None = None
+    mount_std: Tensor | None = None
 
     @classmethod
-    def of(cls, model: CalibratedKinematics, name: str | None) -> SessionFrame:
-        """By the rows of the session in the fit."""
+    def of(cls, model: CalibratedKinematics, name: str | None) -> SetUp:
+        """By the rows of the set-up in the fit."""
         eye = torch.eye(4, dtype=model.geometry.base.dtype, device=model.geometry.base.device)
-        own = next((own for own in model.placement if own.kind == SESSION and name in own.names), None)
+        here = cls(eye, eye)
+        own = next((own for own in model.placement if own.kind in TRANSFORMS and name in own.names), None)
         if name is None or own is None:
-            return cls(eye)
-        number, fitted = own.names.index(name), model.map
+            return here
+        number = own.names.index(name)
         transform, rows = own.constants[number].view(4, 4), own.rows[own.device == number]
         if bool((transform == eye).all()):
-            return cls(eye)
+            return here
+        framed = own.kind == SESSION
+        found = here._replace(**{"transform" if framed else "mount": transform})
+        columns, twists = found._shifts(model, rows, framed=framed)
+        if not framed and not bool(columns.any()):
+            return found._replace(mount_std=own.deviations[number])
+        return found._replace(columns=columns, **{"frame_twists" if framed else "mount_twists": twists})
+
+    def _shifts(self, model: CalibratedKinematics, rows: Tensor, *, framed: bool) -> tuple[Tensor, Tensor]:
+        """Which shifts (c,) of the fit these rows share alone and are rigid motions, and the twists (6, k) of these."""
+        fitted = model.map
         shared, points = fitted.noise.shared, fitted.fitted_points.unflatten(1, (-1, 3))
         others = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
         columns = (shared[rows] != 0).any(1).any(0) & ~(shared[others] != 0).any(1).any(0)
+        if not bool(columns.any()):
+            return columns, shared.new_zeros(NUMBERS_OF_A_FRAME, 0)
         effects = shared[rows][..., columns].flatten(0, 1)
-        slopes = frame_slopes(points[rows], points.new_zeros(3)).flatten(0, 1)
+        slopes = (frame_slopes(points[rows], points.new_zeros(3)) if framed else own_slopes(points[rows])).flatten(0, 1)
         twists = torch.linalg.lstsq(slopes, effects, driver="gelsd").solution
         left = (effects - slopes @ twists).norm(dim=0)
         rigid = left < RIGID_MOTION_SHARE * effects.norm(dim=0)
         columns[columns.clone()] = rigid
-        if int(rigid.sum()) != NUMBERS_OF_A_FRAME:
-            what = f"the hand-eye transform of '{name}'"
+        if int(rigid.sum()) != NUMBERS_OF_A_FRAME and (framed or bool(rigid.any())):
+            what = "the hand-eye transform of one of several cameras"
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
-        return cls(transform, columns, twists[:, rigid])
+        return columns, twists[:, rigid]
 
-    def seen_from(self, base: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The columns, and their twists (6, k) about the origin of a base (4, 4) and along its axes; None for none."""
-        if self.columns is None or self.twists is None:
+    def view(self, poses: Tensor) -> Tensor:
+        """What is measured of poses (M, 4, 4) of the model's tool, m."""
+        return self.transform @ poses @ self.mount
+
+    def shifted(self, points: Tensor) -> Tensor:
+        """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
+        places, found = points.unflatten(1, (-1, 3)), points.new_zeros(*points.shape, 0)
+        if self.frame_twists is not None:
+            found = frame_slopes(places, points.new_zeros(3)) @ self.frame_twists
+        return found if self.mount_twists is None else own_slopes(places) @ self.mount_twists
+
+    def seen_from(self, base: Tensor) -> Shifts:
+        """The twists of a base (4, 4) about its origin and along its axes by the shifts; none for the model's frame."""
+        if self.columns is None or self.frame_twists is None:
             return None
-        shift, turn = self.twists.split(3)
+        shift, turn = self.frame_twists.split(3)
         there = shift + torch.linalg.cross(turn, base[:3, 3:].expand_as(turn), dim=0)
         return self.columns, torch.cat([base[:3, :3].mT @ there, base[:3, :3].mT @ turn])
 
+    def on_tool(self, tool: Tensor) -> Shifts:
+        """What the shifts do to points (3, 3) of a frame on the tool, m; none for the model's tool."""
+        if self.columns is None or self.mount_twists is None:
+            return None
+        return self.columns, own_slopes(tool[None])[0] @ self.mount_twists
 
-def _covariance(fitted: FittedMap, part: slice, shifts: tuple[Tensor, Tensor] | None = None) -> Tensor:
+
+Shifts = tuple[Tensor, Tensor] | None
+"""Numbers (c,) boolean of shifts of a fit, and their effects (k', k)."""
+
+
+def _covariance(fitted: FittedMap, part: slice, shifts: Shifts = None) -> Tensor:
     """Posterior covariance of some parameters, m^2 and rad^2, what the rows leave open included.
 
     With ``shifts``, columns (c,) and effects (k', k), that of their sum with shifts that rows of the fit shared.

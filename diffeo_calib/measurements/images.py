@@ -11,9 +11,9 @@ from torch import Tensor
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, listed, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers
-from diffeo_calib.measurements.pose_frames import pose_jacobian
+from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import RowTable, with_attributes
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class ImageTable(RowTable):
     """
 
     frames: Any
+    points: Tensor
     board: Tensor | None
     lever: Any
     session_names: tuple[str, ...]
@@ -70,11 +71,12 @@ class ImageTable(RowTable):
         board: BoardPrior | None = None,
         doubt: bool = True,
     ) -> Self:
-        """N joint configurations and images of a printed board, taken by a camera on the tool or by fixed ones.
+        """N joint configurations and images of a printed board, taken by cameras on the tool or by fixed ones.
 
         Lenses, board and its pose in every image are found together, see :mod:`~diffeo_calib.cameras.images`; what the
         images leave open of lenses and board is estimated with the robot. Each of several fixed cameras is a set-up of
-        its own, see :meth:`with_sessions`: the model is in the frame of the one with most images.
+        its own, see :meth:`with_sessions`: the model is in the frame of the one with most images. Several on
+        the tool share one frame, and each has its own place there: that of the one with most images is the model's.
 
         Args:
             q: as in the constructor.
@@ -90,7 +92,7 @@ class ImageTable(RowTable):
 
         Raises:
             MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane;
-                several cameras on the tool, or one of which nothing is said.
+                a camera of which nothing is said.
         """
         angles, joints = joint_table(q, joint_names)
         numbers, names = session_numbers(seen_by, len(angles))
@@ -98,7 +100,7 @@ class ImageTable(RowTable):
         seen = image_columns(angles, corners, numbers, known, board, camera_on_tool=camera_on_tool)
         named = {"camera_on_tool": camera_on_tool, "doubt": doubt}
         found = with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
-        return found.with_sessions(seen_by) if len(known) > 1 else found
+        return found.with_sessions(seen_by, remounted=camera_on_tool)
 
     @classmethod
     def from_poses(cls, q: Any, poses: Any, joint_names: Sequence[str] | None = None, **known: Any) -> Self:
@@ -120,9 +122,18 @@ class ImageTable(RowTable):
         names = list(self.cameras)
         return [] if self.seen_by is None else [names[number] for number in self.seen_by.tolist()]
 
-    def set_ups(self, names: Sequence[str] | None) -> Sequence[str] | None:
-        """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them."""
+    def set_ups(self, names: Sequence[str] | None, *, remounted: bool) -> Sequence[str] | None:
+        """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them.
+
+        MeasurementError for several cameras on the tool in several set-ups, which differ in one more frame.
+        """
         if names is None or len(self.cameras) < 2 or len(names) != len(self):
+            return names
+        if self.board is not None:
+            if not remounted or list(names) != self.camera_names:
+                what, fix = "several cameras on the tool", "calibrate with the images of each set-up by themselves"
+                got = few(list(dict.fromkeys(names)))
+                raise MeasurementError.of(what, expected="one board that stayed, so no set-ups", got=got, fix=fix)
             return names
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
@@ -158,6 +169,25 @@ class ImageTable(RowTable):
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
         found = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
         return dict(zip(OF_POSES, found, strict=True))
+
+    def on_frames(self, transforms: Tensor) -> Self:
+        """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.
+
+        The board that a camera saw and the errors of its pose stay where they are.
+        """
+        if self.board is None:
+            raise MeasurementError.of("frames on the tool", expected="poses of a camera on it", got="others")
+        M = transforms.to(self.points)
+        R, frames = M[:, :3, :3], self.frames @ torch.linalg.inv(M)[:, None]
+        changes: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
+        changes |= {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
+        changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
+        for name in ("std", "rotation_std"):
+            known = getattr(self, name)
+            if known is not None:
+                turned = (R.square() @ known.view(len(self), 3, 1).square()).sqrt()
+                changes[name] = turned.view_as(known)
+        return with_attributes(self, **changes, **self.errors_along(R))
 
     def _pose_slopes(self) -> Tensor:
         return pose_jacobian(self.frames, self.lever, self.board)[:, 0]
@@ -207,9 +237,6 @@ def image_columns(
     if given.ndim != 3 or given.shape[2] != 5:
         fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
         raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
-    if len(known) > 1 and camera_on_tool:
-        fix = "calibrate with each camera by itself, or mount the board on the tool and let the cameras stand"
-        raise MeasurementError.of("images of a camera on the tool", expected="one camera", got=len(known), fix=fix)
     check_rows(q, given, "corners")
     given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
     seen_by = torch.zeros(len(q), dtype=torch.int64, device=HOST) if seen_by is None else seen_by

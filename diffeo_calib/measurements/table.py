@@ -427,12 +427,14 @@ class Measurements(ImageTable, SocketTable):
             names: of the set-ups; None for one.
             remounted: whether the device stayed instead, and the markers were mounted anew for each set-up: they all
                 have one measuring frame, and each its own places of the markers; the model's are those of the largest.
+                So are several cameras on the tool that see one board.
 
         Raises:
-            MeasurementError: not one name per row, or poses with markers mounted anew.
+            MeasurementError: not one name per row, or poses with markers mounted anew, but for those of a camera on the
+                tool; several cameras on the tool, in several set-ups.
         """
-        numbers, known = session_numbers(self.set_ups(names), len(self))
-        if remounted and self.lever is not None:
+        numbers, known = session_numbers(self.set_ups(names, remounted=remounted), len(self))
+        if remounted and self.lever is not None and self.board is None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)
         return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)

@@ -25,17 +25,15 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.mounted import Mounted, Turns, mounted_kind
 from diffeo_calib.sensors.places import (
     BALL_IS_THE_MARKER,
-    MOUNTING,
     ROWS,
     SESSION,
     SOCKET,
-    MountedMarkers,
     PlacedDevices,
     Places,
     SessionPlaces,
-    Turns,
     check_same_markers,
     place_sessions,
     placed,
@@ -58,7 +56,7 @@ class Beside:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
         devices: those of readings whose places are known, by kind.
         frames: name of a set-up of positions -> (4, 4) transform from the frame of the kinematics to its own, m.
-        mounted: the markers of set-ups that the kinematics know, or of none, for rows whose markers were mounted anew;
+        mounted: what is on the tool in set-ups that the kinematics know, or in none, for rows that were mounted anew;
             None for kinematics that do not tell how their tips turn.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
@@ -67,7 +65,7 @@ class Beside:
     points: Callable[[Any], Tensor]
     devices: Mapping[str, Devices]
     frames: Mapping[str, Tensor] = field(default_factory=dict)
-    mounted: MountedMarkers | None = None
+    mounted: Mounted | None = None
     unplaced: bool = False
     every_session: bool = False
 
@@ -95,14 +93,17 @@ class Sensor(ABC):
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
 
     @abstractmethod
-    def set_up(self, data: Any) -> Measurements | None:
-        """The rows of one set-up whose device says where the robot stands; None where none does."""
+    def set_up(self, data: Any, known: Callable[[Measurements], Measurements]) -> Measurements | None:
+        """The rows of one set-up whose device says where the robot stands; None where none does.
+
+        ``known``: rows whose tool a model knows as those of the model's, see :meth:`Mounted.in_any_frame`.
+        """
 
     @abstractmethod
     def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them.
 
-        ``turns`` of the tips that carry the points: see :class:`MountedMarkers`.
+        ``turns`` of the tips that carry the points: see :class:`Mounted`.
         """
 
 
@@ -157,7 +158,7 @@ class Positions(Sensor):
             raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
         if not names <= set(known.names):
             new = of_devices(data, names - set(known.names))
-            found = MountedMarkers.of(beside.points(new), new, known.turns)
+            found = mounted_kind(new).of(beside.points(new), new, known.turns)
             known = known.beside(found) if known.names else found
         return Places(known, found=tuple(known.sentences()), numbers=known.fitted_numbers)
 
@@ -173,19 +174,19 @@ class Positions(Sensor):
         away = data.points - points
         return replace(whole, errors=away.norm(dim=-1), away=away)
 
-    def set_up(self, data: Measurements) -> Measurements:
+    def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> Measurements:
         """Of several set-ups the one with most rows."""
-        return data.largest_session()
+        return known(data).largest_session()
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
         names = data.present_sessions
         if len(names) < 2:
-            return (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),) if names else ()
+            kept = not names or (data.remounted and data.lever is not None)  # a camera that the model knows stays
+            return () if kept else (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),)
         if data.remounted:
-            own = MountedMarkers.of(points, data, turns)
-            shifts, deviations = own.shifts.flatten(1), own.deviations.flatten(1)
-            return (PlacedDevices.outside(MOUNTING, own.names, shifts, deviations),)
+            own = mounted_kind(data).of(points, data, turns)
+            return (PlacedDevices.outside(own.kind, own.names, own.constants, own.deviations),)
         found = place_sessions(points, data)
         transforms = found.transforms.flatten(1)
         return (PlacedDevices.outside(SESSION, found.names, transforms, transforms[:, :0]),)
@@ -239,7 +240,7 @@ class Contacts(Sensor):
         names = data.row_sockets
         return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
 
-    def set_up(self, data: Measurements) -> None:
+    def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> None:
         """None: a ball in a socket is where the robot brought it."""
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
@@ -301,7 +302,7 @@ class OtherDevices(Sensor):
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
-    def set_up(self, data: Readings) -> None:
+    def set_up(self, data: Readings, known: Callable[[Measurements], Measurements]) -> None:
         """None: these devices are placed around the robot."""
 
     def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:

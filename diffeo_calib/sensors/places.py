@@ -5,7 +5,7 @@ Where the devices of a calibration were found: what a model keeps of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,18 +17,22 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.placement import PLACES, rigid_fit
+from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, camera_sentences
 from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
 from diffeo_calib.sensors.kinds import kind_of, known_kinds
+from diffeo_calib.sensors.mounted import (
+    GROSS_DISTANCES,
+    MOUNTED_FRAME,
+    MOUNTING,
+    carried_frames,
+    mounted_frame_sentences,
+    mounted_sentences,
+    sessions_of,
+)
 
-FEWEST_ROWS = 4
-"""Rows of a session from which its frame is found."""
 NUMBERS_OF_A_FRAME = 6
-GROSS_DISTANCES = 10.0
-"""Rows that are farther than this many median distances take no part in finding a frame."""
 ROUNDS = 3
 
 ROWS = "these rows"
@@ -120,109 +124,6 @@ def check_same_markers(points: Tensor, measured: Tensor) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class MountedMarkers:
-    """Where the markers sat in some sessions of one measuring frame.
-
-    Args:
-        names: S sessions. shifts: (S, P, 3) of the markers from those of the model, in the frames of their tips, m.
-        deviations: (S, P, 3) of these, m.
-        turns: (N, n) joint values -> (N, P', 3, 3) turns of the tips that carry the model's points, P' >= P.
-        new: names of the sessions whose shifts were found from the rows that are judged.
-    """
-
-    names: tuple[str, ...]
-    shifts: Tensor
-    deviations: Tensor
-    turns: Turns
-    new: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, predicted: Tensor, data: Measurements, turns: Turns) -> MountedMarkers:
-        """The sessions of some rows where these fit points (N, P, 3) of the model's markers best, m; see the class."""
-        names, whose = sessions_of(data)
-        P = min(data.markers, predicted.shape[1])
-        away = turns(data.q)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
-        found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
-        shifts, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
-        return cls(names, shifts, deviations, turns, names)
-
-    def aligned(self, data: Measurements) -> Measurements:
-        """Rows of these sessions with the markers of the model; rows that name no session have these."""
-        known = [*self.names, ""]
-        whose = torch.tensor([known.index(name) for name in data.device_names], dtype=torch.int64, device=HOST)
-        shifts = torch.cat([self.shifts, self.shifts[:1] * 0.0])[whose].to(data.points)
-        return data.shifted(-(self.turns(data.q)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
-
-    def beside(self, other: MountedMarkers) -> MountedMarkers:
-        """These, and those of other names."""
-        new = [number for number, name in enumerate(other.names) if name not in self.names]
-        names = tuple(other.names[number] for number in new)
-        values = ((getattr(one, k) for one in (self, other)) for k in ("shifts", "deviations"))
-        shifts, deviations = (torch.cat([own, theirs[new]]) for own, theirs in values)
-        return replace(self, names=(*self.names, *names), shifts=shifts, deviations=deviations, new=names)
-
-    @property
-    def fitted_numbers(self) -> int:
-        """How many numbers were found from the rows that are judged."""
-        return len(self.new) * self.shifts[0].numel()
-
-    def sentences(self) -> list[str]:
-        """What was found from the rows that are judged."""
-        lines = [f"{self.fitted_numbers} numbers were found from these rows: errors of few rows flatter"]
-        return (lines + mounted_sentences(self.names, self.shifts, self.deviations)) if self.new else []
-
-
-Turns = Callable[[Tensor], Tensor]
-
-
-def _middle(away: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (P, 3) of shifts (M, P, 3) but for gross outliers, and its standard deviations; zero of hidden markers."""
-    middle = away.nanmedian(0).values
-    size = (away - middle).norm(dim=2)
-    kept = torch.where((size <= GROSS_DISTANCES * size.nanmedian(0).values)[..., None], away, torch.nan)
-    count = (~kept.isnan()).sum(0).clamp(min=1)
-    mean = kept.nanmean(0).nan_to_num(0.0)
-    return mean, ((kept - mean).square().nanmean(0).sqrt() / count.sqrt()).nan_to_num(PLACES.remounted_m)
-
-
-def seen_mounted(deviations: Tensor) -> Tensor:
-    """(..., P) boolean: markers that rows of their session showed, by the deviations (..., P, 3) of their places, m."""
-    return deviations.amax(-1) < 0.5 * PLACES.remounted_m
-
-
-def mounted_sentences(names: Sequence[str], shifts: Tensor, deviations: Tensor) -> list[str]:
-    """How far the markers (S, P, 3) of every session are from those of the model, m; none for the model's own."""
-    lines = []
-    for name, shift, std in zip(names, shifts, deviations, strict=True):
-        sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
-        seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
-        known = ", ".join(f"{size:.3f} +- {own:.3f} mm" if shown else "not seen" for (size, own), shown in seen)
-        if bool(shift.any()):
-            markers = "markers are" if len(shift) > 1 else "marker is"
-            lines.append(f"session '{name}': its {markers} {known} away from that of the model")
-    return lines
-
-
-def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
-    """Names of the sessions of some rows, and (N,) the number of each row's, -1 for none.
-
-    Raises:
-        MeasurementError: no sessions, or fewer than 4 rows in one.
-    """
-    if data.session is None:
-        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-    present = data.session[data.session != NO_SOCKET].unique().tolist()
-    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
-    for place, (number, name) in enumerate(zip(present, names, strict=True)):
-        rows = data.session == number
-        own[rows] = place
-        if int(rows.sum()) < FEWEST_ROWS:
-            fix, got = "measure more rows in it, or leave it out", int(rows.sum())
-            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
-    return names, own
-
-
 def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
     """The rigid transform (4, 4) from seen to measured points (N, P, 3) by the rows that are no gross outliers, m."""
     inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
@@ -301,10 +202,13 @@ def placed(data: Readings, points: Tensor) -> Devices:
     return found
 
 
-SESSION, SOCKET, MOUNTING, DRIFT = "session", "socket", "mounting", "drift"
+SESSION, SOCKET, DRIFT = "session", "socket", "drift"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, markers
-that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m, and columns with which
-something drifts, see `KnownDrift`."""
+that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m, frames on the tool, (D, 16)
+transforms from theirs to that of the model's tool, and columns with which something drifts, see `KnownDrift`."""
+SET_UPS = SESSION, MOUNTING, MOUNTED_FRAME
+TRANSFORMS = SESSION, MOUNTED_FRAME
+"""Kinds whose constants are transforms, the unit one for the model's own set-up."""
 MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
@@ -316,7 +220,7 @@ class PlacedDevices:
     """Devices of one kind in the frame of a model.
 
     Args:
-        kind: "session", "socket", "mounting", "drift", or that of readings.
+        kind: "session", "socket", "mounting", "mounted frame", "drift", or that of readings.
         names: D names. constants: (D, c). deviations: (D, k) standard deviations of their increments, m or rad.
         rows: (M,) int64, rows of the fit that they measured. device: (M,) int64, which of them did.
         shown: how their readings are shown; None for other kinds, and in files of old versions.
@@ -369,15 +273,15 @@ class PlacedDevices:
     @property
     def of_model(self) -> bool:
         """Whether this is one set-up alone, whose frame and markers are those of the model."""
-        return self.kind in (SESSION, MOUNTING) and len(self.names) == 1
+        return self.kind in SET_UPS and len(self.names) == 1
 
     @property
     def rows_elsewhere(self) -> Tensor:
         """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
-        if self.kind not in (SESSION, MOUNTING):
+        if self.kind not in SET_UPS:
             return self.rows[:0]
         eye = torch.eye(4, dtype=self.constants.dtype, device=self.constants.device).flatten()
-        away = self.constants - (eye if self.kind == SESSION else 0.0)
+        away = self.constants - (eye if self.kind in TRANSFORMS else 0.0)
         return self.rows[(away != 0).any(1)[self.device.to(away.device)].to(self.rows.device)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> PlacedDevices:
@@ -391,6 +295,8 @@ class PlacedDevices:
         if self.kind == SESSION:
             moved = self.constants.view(-1, 4, 4) @ torch.linalg.inv(T)
             return replace(self, constants=moved.flatten(1))
+        if self.kind == MOUNTED_FRAME:
+            return replace(self, constants=carried_frames(self.constants, T, before, after))
         if self.kind == SOCKET:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
         if self.kind == MOUNTING:
@@ -423,9 +329,9 @@ class PlacedDevices:
         if self.kind == DRIFT:  # which names the robot's joints
             return []
         if self.kind == MOUNTING:
-            return mounted_sentences(
-                self.names, *(each.unflatten(1, (-1, 3)) for each in (self.constants, self.deviations))
-            )
+            return mounted_sentences(self.names, self.constants, self.deviations)
+        if self.kind == MOUNTED_FRAME:
+            return mounted_frame_sentences(self.names, self.constants, self.deviations)
         places = (
             self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
         )  # of transforms, row by row

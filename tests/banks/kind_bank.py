@@ -96,6 +96,14 @@ def _two_cameras() -> Source:
     return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
 
 
+def _two_on_the_tool() -> Source:
+    """Two cameras on the tool, and a printed board."""
+    arms = [camera_arm(70, second=second) for second in (False, True)]
+    rows = images_of_both(arms, (33, 27), 0.1, on_tool=True)
+    golden = Golden(arms[0].arm.nominal, rows, golden_bank.camera_on_tool().scales, rows.q[:5])
+    return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
+
+
 def _images_and_tracker() -> Source:
     """Images of a board, and in other rows a tracker's marker on the same tool."""
     seen, tracker = camera_arm(60), SimulatedArm(seed=1)
@@ -172,6 +180,7 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
     "images of a board": _images,
     "two cameras": _two_cameras,
+    "two cameras on the tool": _two_on_the_tool,
     "images and a tracker": _images_and_tracker,
     "several kinds": _several,
     "laser beams": _beams,
@@ -185,7 +194,7 @@ POSITIONED = ("positions", "hidden markers")
 FREE = ("ball in sockets", "distances", "heights", "images")
 """Kinds without a measured position."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
-ON_TOOL = ("camera on the tool", "images of a board", "images and a tracker")
+ON_TOOL = ("camera on the tool", "images of a board", "images and a tracker", "two cameras on the tool")
 CAMERAS = (*ON_TOOL, "two cameras")
 
 

@@ -71,13 +71,21 @@ def test_each_camera_sees_the_board_in_the_poses_that_are_planned_for_it() -> No
     assert int(corners_in_truth(alone.q, arms["right"], on_tool=False).min()) >= FEWEST
 
 
+def test_each_camera_on_the_tool_sees_the_board() -> None:
+    plan = dc.plan(kind_named("two cameras on the tool").model, drawn("two cameras on the tool"), 8)
+    arms = {"left": camera_arm(70), "right": camera_arm(70, second=True)}
+    assert set(plan.devices) == set(arms)
+    for name, q in zip(plan.devices, plan.q, strict=True):
+        assert int(corners_in_truth(q[None], arms[name], on_tool=True)) >= FEWEST
+
+
 def test_candidates_that_no_camera_sees_are_refused() -> None:
     q = candidates(wrist().robot, 40)
     with pytest.raises(dc.DiffeoCalibError, match=r"candidates that can be measured: expected at least 5.*its board"):
         dc.plan(wrist().model, q, 5)
 
 
-@pytest.mark.parametrize("kind", ["images of a board", "two cameras"])
+@pytest.mark.parametrize("kind", ["images of a board", "two cameras", "two cameras on the tool"])
 def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
     """Their noise and what lens and board do to them, by the poses of the model alone."""
     model = kind_named(kind).model
@@ -88,8 +96,8 @@ def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
         assert float(sees(one.camera, one.boards(points)).double().mean()) > 0.9
         known, by_lens = one.tells(points)
         shared = model.map.noise.shared[rows].clone()
-        if one.frame.columns is not None:
-            shared[..., one.frame.columns] = 0.0
+        if one.set_up.columns is not None:
+            shared[..., one.set_up.columns] = 0.0
         assert float((by_lens @ one.effects - shared).norm() / shared.norm()) < 0.02
         sizes = [each.diagonal(dim1=1, dim2=2).sum(1) for each in (known, model.map.noise.covariance[rows])]
         assert 0.7 < float((sizes[0] / sizes[1]).median()) < 1.0

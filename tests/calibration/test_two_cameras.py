@@ -1,4 +1,4 @@
-"""A robot by images of two fixed cameras that see one board: truth, places of both, and what is refused."""
+"""A robot by images of two cameras, fixed or on the tool: truth, places of both, and what is refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ import torch
 from command_bank import Command
 from golden_bank import camera_on_tool
 from kind_bank import Kind, kind_named
-from simulated_camera import BOARD_ON_FLANGE, BOARD_PRIOR, CameraArm, fixed_camera_arm, images_of_both
+from simulated_camera import (
+    BOARD_ON_FLANGE,
+    BOARD_PRIOR,
+    CAMERA,
+    CAMERA_BESIDE,
+    CameraArm,
+    fixed_camera_arm,
+    images_of_both,
+)
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -24,7 +32,9 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots.se3 import rotation
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -117,12 +127,85 @@ def test_sessions_of_a_camera_are_set_ups_of_their_own() -> None:
     ]
 
 
+# --- on the tool ----------------------------------------------------------------------------------------------------
+
+
+PLACES_ON_TOOL = dict(zip(("left", "right"), (CAMERA, CAMERA_BESIDE), strict=True))
+
+
+def on_tool() -> Kind:
+    return kind_named("two cameras on the tool")
+
+
+def check_hand_eyes(model: Any, largest_std: float) -> None:
+    """Every camera is where it is, by the deviations that are told of it."""
+    found = HandEye.of_each(model, camera_on_tool=True)
+    assert set(found) == set(PLACES_ON_TOOL)
+    for name, given in PLACES_ON_TOOL.items():
+        truth, known = torch.tensor(given, dtype=torch.float64), found[name].camera.known
+        away = known.pose[:3, :3] @ rotation(truth[None, 3:])[0].mT
+        turn = 0.5 * (away - away.mT)[[2, 0, 1], [1, 2, 0]]
+        errors = torch.cat([known.pose[:3, 3] - truth[:3], turn])
+        assert bool((errors.abs() < 4 * known.deviations).all()), (name, errors, known.deviations)
+        assert float(known.deviations[:2].max()) < largest_std
+
+
+def test_every_camera_is_where_it_is_on_the_tool() -> None:
+    check_hand_eyes(on_tool().model, 1e-4)  # along the axis of the flange, an offset of its joint would do the same
+
+
+def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> None:
+    rows = on_tool().moved
+    again: Any = dc.recalibrate(on_tool().model, rows).model
+    check_hand_eyes(again, 1.5e-4)
+    dc.save(again, tmp_path / "again.safetensors")
+    assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 10  # pyright: ignore
+    alone = rows.rows([name == "right" for name in rows.camera_names])
+    check_hand_eyes(dc.recalibrate(on_tool().model, alone).model, 1e-4)
+
+
+def test_fixed_cameras_of_a_recalibrated_model_are_where_they_are() -> None:
+    found = HandEye.of_each(dc.recalibrate(kind().model, kind().moved).model, camera_on_tool=False)
+    for name, arm in zip(("left", "right"), arms(), strict=True):
+        own = found[name].camera.known
+        away = own.pose[:3, 3] - torch.linalg.inv(arm.arm.truth.base)[:3, 3]
+        assert bool((away.abs() < 4 * own.deviations[:3]).all())
+        assert float(own.deviations[:3].max()) < 2e-3
+
+
+def test_images_of_one_of_the_cameras_are_judged_by_its_place() -> None:
+    for own in (on_tool(), kind()):
+        right = torch.tensor([name == "right" for name in own.new.camera_names])
+        rows: Any = own.new.rows(right)
+        alone = dc.Measurements.from_images(
+            rows.q,
+            rows.corners,
+            own.data.cameras,
+            seen_by=rows.camera_names,
+            camera_on_tool=own is on_tool(),
+        )
+        found: Any = dc.evaluate(own.model, alone)
+        assert found.numbers == 0
+        assert found.rms < 2e-3
+
+
+def test_poses_of_two_boards_in_cameras_on_the_tool() -> None:
+    """By another program, without corners."""
+    rows = on_tool().data
+    boards = inverse_poses(rows.poses)
+    names = rows.camera_names
+    data = dc.Measurements.from_poses(rows.q, boards, rows.joint_names, camera_on_tool=True)
+    model = dc.calibrate(on_tool().robot, data.with_sessions(names, remounted=True), hyperparameters=SCALES).model
+    assert on_tool().error_mm(model(rows.q), rows.q) < 0.6
+
+
 # --- what is refused ------------------------------------------------------------------------------------------------
 
 
-def test_several_cameras_on_the_tool_are_refused() -> None:
-    with pytest.raises(MeasurementError, match=r"camera on the tool.*got 2"):
-        of_corners(camera_on_tool=True)
+def test_several_cameras_on_the_tool_have_no_other_set_ups() -> None:
+    rows = on_tool().data
+    with pytest.raises(MeasurementError, match=r"several cameras on the tool.*day 1"):
+        rows.with_sessions(["day 1"] * 20 + ["day 2"] * (len(rows) - 20))
 
 
 def test_a_camera_of_which_nothing_is_said_is_refused() -> None:

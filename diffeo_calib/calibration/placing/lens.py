@@ -11,15 +11,16 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.seeing import sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
+from diffeo_calib.sensors.mounted import View
 from diffeo_calib.sensors.places import PlacedDevices
 
 SIZE_WARNED, SIZE_REFUSED = 0.006, 0.02
@@ -102,18 +103,18 @@ class LensAndBoard(CameraErrors):
 
     @classmethod
     def of_table(
-        cls, data: Measurements, rows: Tensor, registration: Identification, moved: Sequence[Tensor] = ()
+        cls, data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions] = ()
     ) -> list[Any]:
         """That of the images of a table, none for other tables.
 
         Args:
             data: in the frame of one session. rows: (M,) numbers in the whole table. registration: of all of them.
-            moved: numbers of the rows in each other session, whose frame was found with lengths that may be wrong.
+            sessions: of these rows, whose places were found with lengths that may be wrong.
 
         Raises:
             MeasurementError: a board of another size than was said.
         """
-        found, others = [], [torch.isin(rows, own) for own in moved]
+        found: list[Any] = []
         for shared in data.shared_errors():
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
             deviations, explained = shared.noise.diagonal(dim1=1, dim2=2).sqrt(), []
@@ -121,14 +122,14 @@ class LensAndBoard(CameraErrors):
                 own = shared.seen_by == number
                 nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
                 explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _rms_distance(deviations[own])))
-            places = _places(data, registration, others)
+            places = _places(data, rows, registration, sessions)
             apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             on_tool = data.board is not None
             found.append(
                 cls(shared, rows, on_tool, data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained))
             )
-            found[-1].check_size(relative_size(data, registration, others))
+            found[-1].check_size(relative_size(data, rows, registration, sessions))
         return found
 
     def check_size(self, larger: float) -> None:
@@ -159,15 +160,15 @@ class LensAndBoard(CameraErrors):
             cameras[name] = replace(camera, unknowns=camera.unknowns + change, root=root)
         return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
 
-    def sees(self, row: int, points: Tensor, frames: Mapping[str, Tensor]) -> Tensor:
+    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         """See :class:`DeviceSet`: whether the camera of the row sees its board."""
         number = self.shared.seen_by[self.rows == row].tolist()
         if not number:
-            return super().sees(row, points, frames)
+            return super().sees(row, points, views)
         name, camera = [*self.shared.cameras.items()][number[0]]
         poses = poses_from_marks(points, self.lever)
-        for T in [T for set_up, T in frames.items() if set_up.partition("/")[0] == name][-1:]:
-            poses = T @ poses
+        for view in [view for set_up, view in views.items() if set_up.partition("/")[0] == name][-1:]:
+            poses = view(poses)
         return sees(camera, inverse_poses(poses) if self.on_tool else poses)
 
     def placed(self) -> PlacedDevices:
@@ -203,14 +204,16 @@ def _at_tool(effects: Tensor, errors: Tensor, part: slice) -> float:
     return _rms_distance((effects[..., part] @ errors[part]).view(*effects.shape[:2], -1).norm(dim=2))
 
 
-def relative_size(data: Measurements, registration: Identification, others: Sequence[Tensor] = ()) -> float:
+def relative_size(
+    data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions] = ()
+) -> float:
     """How much longer the distances of a board from its camera are than a robot as described says, as a share.
 
-    Errors of base, markers, frames of other sessions (M,) and scale that explain the residuals of the registration, by
-    reweighted least squares.
+    Errors of base, markers, places of other sessions and scale that explain the residuals of the registration, by
+    reweighted least squares. Arguments as of :meth:`LensAndBoard.of_table`.
     """
     geometry = registration.geometry
-    slopes = torch.cat([_places(data, registration, others), data.by_board_size()], 2)
+    slopes = torch.cat([_places(data, rows, registration, sessions), data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     found = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):
@@ -221,13 +224,13 @@ def relative_size(data: Measurements, registration: Identification, others: Sequ
     return float(found[-1])
 
 
-def _places(data: Measurements, registration: Identification, others: Sequence[Tensor]) -> Tensor:
-    """Derivatives (M, 3 P, c) of points by the places of base, what is on the tool, and frames of rows (M,) boolean."""
+def _places(data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions]) -> Tensor:
+    """Derivatives (M, 3 P, c) of points by the places of base, what is on the tool, and each session but the first."""
     geometry = registration.geometry
     slopes = geometry.sensitivities(data.q).flatten(1, 2)
-    found = [slopes[..., geometry.slices[name]] for name in ("base", "tool")]
-    frame = frame_slopes(data.points, data.points.mean((0, 1)))
-    return torch.cat([*found, *(frame * own[:, None, None] for own in others)], 2)
+    base, tool = (slopes[..., geometry.slices[name]] for name in ("base", "tool"))
+    own = [one.own_places(data, tool, rows) for one in sessions]
+    return torch.cat([base, tool, *own], 2)
 
 
 def _rms_distance(coordinates: Tensor) -> float:

@@ -339,8 +339,7 @@ def _by_coordinates(
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
-    moved = [rows for one in sessions for _, rows in list(one.groups())[1:]]
-    cameras = LensAndBoard.of_table(table, own.rows, stages[0], moved)
+    cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
     placement = Placement((*sessions, *sockets, *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)
 

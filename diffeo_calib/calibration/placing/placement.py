@@ -25,6 +25,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.sensors.mounted import Mounted, View
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
@@ -101,6 +102,29 @@ class Settled(NamedTuple):
         return self.joint()[self.place, self.place]
 
 
+class SettledAgain(NamedTuple):
+    """Result of a recalibration for the shifts of one set of devices, around the old model.
+
+    Args:
+        shifts: (c,) their posterior mean. joint, place: as of :class:`Settled`. first: number of the first new row.
+        centre: (3,) the middle of the rows in the old frame, m. transform: (4, 4) from there to the new one, m.
+        known: what the old model knew of the tool in each set-up.
+    """
+
+    shifts: Tensor
+    joint: Callable[[], Tensor]
+    place: slice
+    first: int
+    centre: Tensor
+    transform: Tensor
+    known: Mounted
+
+    @property
+    def covariance(self) -> Tensor:
+        """(c, c) of the shifts."""
+        return self.joint()[self.place, self.place]
+
+
 class DeviceSet(ABC):
     """Devices of one kind and the rows that they measured."""
 
@@ -137,6 +161,10 @@ class DeviceSet(ABC):
     def placed(self) -> PlacedDevices | None:
         """Their entries for the model file; None for nothing."""
 
+    def placed_again(self, found: SettledAgain) -> PlacedDevices | None:
+        """Entries for the file of a recalibrated model; None where devices are placed around it."""
+        return None
+
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
@@ -156,15 +184,15 @@ class DeviceSet(ABC):
         """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
         return ()
 
-    def frames(self) -> Mapping[str, Tensor]:
-        """Name of a set-up -> (4, 4) from the model's frame to its, m; none if all rows are in the model's."""
+    def views(self) -> Mapping[str, View]:
+        """Name of a set-up -> how it sees poses of the model; none if there is one set-up."""
         return {}
 
-    def sees(self, row: int, points: Tensor, frames: Mapping[str, Tensor]) -> Tensor:
+    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         """(M,) boolean: whether points (M, P, 3), m, can be measured as a row was, as far as these devices measured it.
 
         Args:
-            row: number in the table. points: of the model. frames: those of all devices.
+            row: number in the table. points: of the model. views: those of all devices.
         """
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
@@ -208,10 +236,10 @@ class Placement:
 
     def sees(self, row: int, points: Tensor) -> Tensor:
         """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""
-        frames = {name: T for own in self.sets for name, T in own.frames().items()}
+        views = {name: view for own in self.sets for name, view in own.views().items()}
         found = torch.ones(len(points), dtype=torch.bool, device=points.device)
         for own in self.sets:
-            found &= own.sees(row, points, frames)
+            found &= own.sees(row, points, views)
         return found
 
     def shared(self, data: SeenRows) -> Tensor | None:
@@ -240,6 +268,16 @@ class Placement:
         for own in self.sets:
             data = own.aligned(data)
         return data
+
+    def placed_again(self, fitted: Fit, known: SettledAgain) -> list[PlacedDevices]:
+        """Entries of the sets that a recalibration settles, whose shifts are the last ones of its fit."""
+        joint, found = cache(lambda: _covariance(fitted.model, fitted.model.noise)), []
+        start = len(fitted.shifts) - sum(own.size for own in self.sets)
+        for own in self.sets:
+            part = slice(start, start + own.size)
+            found.append(own.placed_again(known._replace(shifts=fitted.shifts[part], joint=joint, place=part)))
+            start += own.size
+        return [own for own in found if own is not None]
 
     def sentences(self) -> list[str]:
         """Where all devices are."""

@@ -20,7 +20,14 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import (
+    DeviceSet,
+    OtherLabel,
+    OtherRows,
+    SeenRows,
+    Settled,
+    SettledAgain,
+)
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -32,15 +39,8 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-from diffeo_calib.sensors.places import (
-    MOUNTING,
-    SESSION,
-    MountedMarkers,
-    PlacedDevices,
-    mounted_sentences,
-    place_sessions,
-    sessions_of,
-)
+from diffeo_calib.sensors.mounted import Mounted, View, mounted_kind, sessions_of
+from diffeo_calib.sensors.places import SESSION, PlacedDevices, place_sessions
 from diffeo_calib.sensors.tables import Coordinates, measured_rows
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Sessions(DeviceSet):
     @classmethod
     def of_table(
         cls, robot: Tree, own: Coordinates, count: int, progress: Progress
-    ) -> tuple[list[DeviceSet], Measurements]:
+    ) -> tuple[list[Sessions], Measurements]:
         """The sessions of a table of ``count`` rows, and the rows as those of one; none for one session.
 
         Raises:
@@ -154,6 +154,19 @@ class Sessions(DeviceSet):
         session = self.session.to(effects.device)
         return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
 
+    def own_places(self, data: Measurements, by_tool: Tensor, rows: Tensor) -> Tensor:
+        """Derivatives (M, 3 P, c) of points by the places of sessions, of each but one.
+
+        Args:
+            data: M rows. by_tool: (M, 3 P, 3 P) their derivatives by points on the tool. rows: their numbers.
+        """
+        slopes, session = self.place_slopes(data, by_tool), self.session.to(rows.device)[rows]
+        return torch.cat([slopes * (session == number)[:, None, None] for number in self.others], 2)
+
+    @abstractmethod
+    def place_slopes(self, data: Measurements, by_tool: Tensor) -> Tensor:
+        """(M, 3 P, k) of one session; arguments as of :meth:`own_places`."""
+
     def by_markers(self, data: SeenRows) -> Tensor:
         """(N, R, 3 P) effects of markers that were mounted again."""
         tool = data.nominal.geometry.slices["tool"]
@@ -218,6 +231,10 @@ class SessionFrames(Sessions):
         here = torch.eye(4, dtype=self.transforms.dtype, device=HOST)[None]  # of rows of no session
         return data.in_frames(torch.cat([torch.linalg.inv(self.transforms), here])[self.numbers(data)])
 
+    def place_slopes(self, data: Measurements, by_tool: Tensor) -> Tensor:
+        """See :class:`Sessions`."""
+        return frame_slopes(data.points, data.points.mean((0, 1)))
+
     @property
     def size(self) -> int:
         """Six of each frame, and three of each marker that may have moved, in each session but the reference."""
@@ -236,18 +253,27 @@ class SessionFrames(Sessions):
 
     def settled(self, found: Settled) -> SessionFrames:
         """See :class:`DeviceSet`."""
-        transforms, others = self.transforms.clone(), self.others
         centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
-        for number, own in zip(others, found.shifts.view(len(others), -1), strict=True):
+        return self._stepped(found.shifts, centre, torch.eye(4, dtype=centre.dtype, device=centre.device))
+
+    def _stepped(self, shifts: Tensor, centre: Tensor, T: Tensor) -> SessionFrames:
+        """After shifts (c,) about a centre (3,) in a frame, from which T (4, 4) leads to that of the reference, m."""
+        transforms, others = self.transforms.clone(), self.others
+        for number, own in zip(others, shifts.view(len(others), -1), strict=True):
             step = torch.eye(4, dtype=centre.dtype, device=centre.device)
             step[:3, :3] = rotation(PLACES.session_m_rad * own[3:6])
             step[:3, 3] = centre + PLACES.session_m_rad * own[:3] - step[:3, :3] @ centre
-            transforms[number] = transforms[number] @ step
+            transforms[number] = transforms[number] @ T @ step @ torch.linalg.inv(T)
         return replace(self, transforms=transforms)
 
-    def frames(self) -> dict[str, Tensor]:
+    def placed_again(self, found: SettledAgain) -> PlacedDevices:
         """See :class:`DeviceSet`."""
-        return dict(zip(self.names, self.transforms, strict=True))
+        own = self._stepped(found.shifts, found.centre, found.transform).placed()
+        return replace(own, rows=own.rows + found.first)
+
+    def views(self) -> dict[str, View]:
+        """See :class:`DeviceSet`."""
+        return {name: lambda poses, T=T: T @ poses for name, T in zip(self.names, self.transforms, strict=True)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         """See :class:`DeviceSet`."""
@@ -284,13 +310,13 @@ class SessionFrames(Sessions):
 
 @dataclass(frozen=True, eq=False)
 class Mountings(Sessions):
-    """Where markers sit that were mounted anew in each session, in one measuring frame.
+    """What is on the tool in each session of one measuring frame: markers mounted anew, or several cameras.
 
     Args:
-        mounted: the sessions and their markers.
+        mounted: the sessions and their markers or frames.
     """
 
-    mounted: MountedMarkers
+    mounted: Mounted
 
     @classmethod
     def around(cls, data: Measurements, geometry: Geometry, reference: int) -> Mountings:
@@ -299,47 +325,60 @@ class Mountings(Sessions):
 
     @classmethod
     def of_points(cls, data: Measurements, geometry: Geometry, seen: Tensor, reference: int) -> Mountings:
-        """The markers of rows whose points (N, P, 3) are known with the markers of the reference, m."""
-        found = MountedMarkers.of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
-        other = torch.arange(len(found.names), device=HOST)[:, None, None] != reference
-        found = replace(found, shifts=found.shifts * other, deviations=found.deviations * other, new=())
-        return cls(found.names, reference, sessions_of(data)[1], found.shifts.shape[1], found)
+        """What is on the tool in rows whose points (N, P, 3) are known with the tool of the reference, m."""
+        found = mounted_kind(data).of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
+        return cls(found.names, reference, sessions_of(data)[1], data.markers, found.with_reference(reference))
 
     def aligned(self, data: Any) -> Any:
         """See :class:`Sessions`."""
         self.numbers(data)
         return self.mounted.aligned(data)
 
+    def place_slopes(self, data: Measurements, by_tool: Tensor) -> Tensor:
+        """See :class:`Sessions`."""
+        return by_tool
+
     @property
     def size(self) -> int:
-        """Three of each marker in each session but the reference."""
-        return len(self.others) * 3 * self.markers
+        """Numbers of each session but the reference."""
+        return len(self.others) * self.mounted.deviations.shape[1]
 
     def effects(self, data: SeenRows) -> Tensor:
-        """See :class:`DeviceSet`: what is left of the places of the markers."""
-        return self.of_each(self.by_markers(data))
+        """See :class:`DeviceSet`: what is left of the places on the tool."""
+        tool, slopes = data.nominal.geometry.slices["tool"], data.slopes
+        by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
+        return self.of_each(self.mounted.increments(data.points.unflatten(1, (-1, 3)), slopes, by_tool))
 
     def settled(self, found: Settled) -> Mountings:
         """See :class:`DeviceSet`."""
-        shifts, deviations = self.mounted.shifts.clone(), self.mounted.deviations.clone()
-        shape = len(self.others), -1, 3
-        shifts[self.others] += PLACES.remounted_m * found.shifts.view(shape)
-        deviations[self.others] = PLACES.remounted_m * found.covariance.diagonal().clamp(min=0).sqrt().view(shape)
-        return replace(self, mounted=replace(self.mounted, shifts=shifts, deviations=deviations))
+        steps = found.shifts.view(len(self.others), -1)
+        return replace(self, mounted=self.mounted.moved(self.others, steps, found.covariance))
+
+    def placed_again(self, found: SettledAgain) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        steps = found.shifts.view(len(self.others), -1)
+        mounted = self.mounted.moved(self.others, steps, found.covariance).after(found.known)
+        own = replace(self, mounted=mounted).placed()
+        return replace(own, rows=own.rows + found.first)
+
+    def views(self) -> dict[str, View]:
+        """See :class:`DeviceSet`."""
+        return dict(zip(self.names, self.mounted.views(), strict=True))
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""
         rows = (self.session != NO_SOCKET).nonzero()[:, 0]
-        values = self.mounted.shifts.flatten(1), self.mounted.deviations.flatten(1)
-        return PlacedDevices(MOUNTING, self.names, *values, rows, self.session[rows])
+        values = self.mounted.constants, self.mounted.deviations
+        return PlacedDevices(self.mounted.kind, self.names, *values, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
-        return {"mountings": dict(zip(self.names, self.mounted.shifts.tolist(), strict=True))}
+        each = self.mounted.constants.unflatten(1, self.mounted.shape).tolist()
+        return {"mountings": dict(zip(self.names, each, strict=True))}
 
     def sentences(self) -> list[str]:
-        """How far the markers of every other session are from those of the reference."""
-        return mounted_sentences(self.names, self.mounted.shifts, self.mounted.deviations)
+        """Where those of every other session are, from those of the reference."""
+        return self.mounted.sentences_of_each()
 
 
 def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:

@@ -17,12 +17,11 @@ from diffeo_calib.calibration.planning.sensors import Options, Scene, Sensor, Wh
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.cameras.seeing import expected, sees
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.hand_eye import SessionFrame
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.kinematics.hand_eye import SetUp
 from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
 from diffeo_calib.measurements.poses import mark_jacobian, poses_from_marks
 from diffeo_calib.sensors.board_camera import BoardCamera
-from diffeo_calib.sensors.places import SESSION, PlacedDevices
+from diffeo_calib.sensors.places import TRANSFORMS, PlacedDevices
 
 SMALLEST_REST_M = 1e-6
 
@@ -33,7 +32,7 @@ class BoardImages(Sensor):
 
     Args:
         name: of the camera. seen: lens, board and what its images showed. lever: of the model's poses, m.
-        frame: the measuring frame in which it stands.
+        set_up: where it is.
         effects: (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a
             registration. rest: (9, 9) noise of a pose beyond that of its corners, m^2.
     """
@@ -41,7 +40,7 @@ class BoardImages(Sensor):
     name: str = ""
     seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
     lever: float = 0.0
-    frame: SessionFrame = None  # pyright: ignore[reportAssignmentType]
+    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]
     effects: Tensor | None = None
     rest: Tensor | None = None
 
@@ -52,7 +51,7 @@ class BoardImages(Sensor):
 
     def boards(self, points: Tensor) -> Tensor:
         """Poses (M, 4, 4) of the board in the camera's frame by the model's points (M, 9), m."""
-        poses = self.frame.transform @ poses_from_marks(points.unflatten(1, (3, 3)), self.lever)
+        poses = self.set_up.view(poses_from_marks(points.unflatten(1, (3, 3)), self.lever))
         return inverse_poses(poses) if self.seen.on_tool else poses
 
     def where(self, model: CalibratedKinematics) -> Where:
@@ -65,10 +64,12 @@ class BoardImages(Sensor):
         boards = self.boards(points)
         covariance, effects = expected(self.camera, boards)
         if self.seen.on_tool:
-            slopes = -camera_jacobian(inverse_poses(boards), self.lever, boards[:, :3, 3])
+            M = self.set_up.mount
+            tool, seen = inverse_poses(M @ boards), boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
+            slopes = -camera_jacobian(tool, self.lever, seen) @ torch.block_diag(*[M[:3, :3]] * 2)
         else:
             slopes = mark_jacobian(poses_from_marks(points.unflatten(1, (3, 3)), self.lever), self.lever)
-            slopes = slopes @ torch.block_diag(*[self.frame.transform[:3, :3].mT] * 2)
+            slopes = slopes @ torch.block_diag(*[self.set_up.transform[:3, :3].mT] * 2)
         return slopes @ covariance @ slopes.mT, slopes @ effects
 
     def options(self, scene: Scene) -> Options:
@@ -83,9 +84,8 @@ class BoardImages(Sensor):
             noise = noise + (0.0 if self.rest is None else self.rest)
             shared = by_lens @ (self.camera.root if self.effects is None else self.effects)
             shared = self._new(scene, shared) if self.effects is None else shared
-        if self.frame.columns is not None and self.frame.twists is not None and scene.shifts:
-            turned = frame_slopes(points.unflatten(1, (-1, 3)), points.new_zeros(3)) @ self.frame.twists
-            shared = shared.index_add(2, self.frame.columns.nonzero()[:, 0], turned)
+        if self.set_up.columns is not None and scene.shifts:
+            shared = shared.index_add(2, self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points))
         noise = noise if self.std is None else self.std**2 * eye.expand_as(noise)
         return Options(rows, eye.expand(len(rows), 9, 9), shared, noise, torch.zeros_like(rows), (self.name,))
 
@@ -98,27 +98,27 @@ def board_images(model: CalibratedKinematics, placed: PlacedDevices) -> list[Sen
 def _of_camera(model: CalibratedKinematics, placed: PlacedDevices, number: int, seen: BoardCamera) -> BoardImages:
     """One camera, where it stood last."""
     rows, noise = placed.rows[placed.device == number], model.map.noise
-    frame = SessionFrame.of(model, _last_session(model, rows))
-    found = BoardImages(None, placed.names[number], seen, model.bodies.pose_lever(), frame)
+    set_up = SetUp.of(model, _last_session(model, rows))
+    found = BoardImages(None, placed.names[number], seen, model.bodies.pose_lever(), set_up)
     if seen.camera.view is None or model.registration is not None:
         return found
     stood = _same_session(model, rows)
     points = model(model.configurations[stood]).detach().flatten(1)
     known, by_lens = found.tells(points)
     of_fit = noise.shared[stood][:, :9].clone()
-    if frame.columns is not None:
-        of_fit[..., frame.columns] = 0.0
+    if set_up.columns is not None:
+        of_fit[..., set_up.columns] = 0.0
     effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
     beyond = (noise.covariance[stood][:, :9, :9] - known).median(0).values
     values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
     rest = (axes * values.clamp(min=SMALLEST_REST_M**2)) @ axes.mT
-    return BoardImages(None, found.name, seen, found.lever, frame, effects, rest)
+    return BoardImages(None, found.name, seen, found.lever, set_up, effects, rest)
 
 
 def _last_session(model: CalibratedKinematics, rows: Tensor) -> str | None:
     """Name of the session of the last of some rows; None where there are none, and in the place of a registration."""
     for own in model.placement if model.registration is None else ():
-        if own.kind == SESSION and len(own.rows):
+        if own.kind in TRANSFORMS and len(own.rows):
             here = torch.isin(own.rows, rows)
             return own.names[int(own.device[here][own.rows[here].argmax()])] if bool(here.any()) else None
     return None
@@ -128,6 +128,6 @@ def _same_session(model: CalibratedKinematics, rows: Tensor) -> Tensor:
     """Those of some rows that are of the session of the last one."""
     name = _last_session(model, rows)
     for own in model.placement if name is not None else ():
-        if own.kind == SESSION:
+        if own.kind in TRANSFORMS:
             return rows[torch.isin(rows, own.rows[own.device == own.names.index(name)])]
     return rows

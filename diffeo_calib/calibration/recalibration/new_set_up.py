@@ -34,6 +34,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, check_shown
+from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -139,7 +140,8 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         nominal = robot_map(old)
     place, sessions = None, list[DeviceSet]()
     if own is not None:
-        own = own._replace(table=with_markers(own.table, nominal.geometry.markers, model.lever))
+        table = with_markers(own.table, nominal.geometry.markers, model.lever)
+        own = own._replace(table=mounted_of(model).in_any_frame(table))
         device = measured_rows(own.table)
         if device is not None:
             place, seen = _place_of_device(old, nominal, model.lever, device.table, REGISTERED_M.get(marker))

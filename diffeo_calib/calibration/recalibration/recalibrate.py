@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import parts
-from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.placement import Placement, SettledAgain
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
 from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
@@ -49,6 +49,8 @@ from diffeo_calib.kinematics.re_registration.register_again import carried_devic
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.errors import Evaluations
+from diffeo_calib.sensors.mounted import mounted_of
+from diffeo_calib.sensors.places import PlacedDevices
 
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
@@ -199,7 +201,7 @@ def _result(
     again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
-    again.placement = devices_beside(again, new)
+    again.placement = _with_settled(devices_beside(again, new), model, place, rows, fitted)
     before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.left_out))
     if model.summary is not None:
         known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
@@ -225,6 +227,16 @@ def _result(
         shift=None if found is None else (again.geometry.tool - place.own_markers) * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place, changes),
     )
+
+
+def _with_settled(
+    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: Before, rows: NewRows, fitted: Fit
+) -> tuple[PlacedDevices, ...]:
+    """The devices, set-ups where the fit puts them."""
+    first = len(fitted.problem.y) - len(rows)
+    around = SettledAgain(fitted.shifts, Tensor, slice(0), first, rows.centre, place.transform, mounted_of(model))
+    settled = {own.kind: own for own in rows.placement.placed_again(fitted, around)}
+    return tuple(settled[own.kind].beside(own) if own.kind in settled else own for own in placement)
 
 
 def _ball_measured(before: Before) -> bool:

@@ -41,6 +41,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
+from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.places import DRIFT, PlacedDevices
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -142,7 +143,8 @@ def registration_rows(data: Any, model: Any) -> Measurements | None:
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
-    own = [(sensor_of(part), sensor_of(part).set_up(part)) for part, _ in rows_of_one_kind(data)]
+    known = mounted_of(model).in_any_frame
+    own = [(sensor_of(part), sensor_of(part).set_up(part, known)) for part, _ in rows_of_one_kind(data)]
     return next((sensor.with_points(rows, model) for sensor, rows in own if rows is not None), None)
 
 
