@@ -143,14 +143,17 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     )
 
 
-def motion_lines(found: Registration, tips: Sequence[str], *, robot_changed: bool = False) -> Iterator[str]:
-    """Where measuring frame and markers are now, and how far from where they were, as if the robot had not changed."""
+def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -> Iterator[str]:
+    """Where measuring frame and markers are now, and how far from where they were, as if the robot had not changed.
+
+    With ``doubt``, what its change does to these places, no probability is stated: it would hold without one alone.
+    """
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
-        yield from _marker_lines(found, tips)
-    if robot_changed:
-        yield "  these places were found as if the robot had not changed: a part of the change below is in them"
+        yield from _marker_lines(found, tips, sure=not doubt)
+    if doubt:
+        yield f"  these places were found as if the robot had not changed{doubt}"
 
 
 def frame_lines(found: Registration) -> Iterator[str]:
@@ -163,7 +166,7 @@ def frame_lines(found: Registration) -> Iterator[str]:
     yield f"  known to {_short(shift)} mm at the middle of the rows, and to {_short(small)} deg"
 
 
-def _marker_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
+def _marker_lines(found: Registration, tips: Sequence[str], *, sure: bool) -> Iterator[str]:
     rigid = found.lever is not None
     places, deviations = found.markers, found.marker_deviations
     tips = tips if len(tips) == len(places) else [tips[0]] * len(places)
@@ -174,7 +177,7 @@ def _marker_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"
     if found.shift is not None:
         largest = 1e3 * float(found.shift.norm(dim=1).max())
-        stayed = "" if found.same_place is None else f" (unmoved with probability {found.same_place:.2f})"
+        stayed = "" if found.same_place is None or not sure else f" (unmoved with probability {found.same_place:.2f})"
         yield f"  that is {largest:.3f} mm from where it was{stayed}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from math import inf
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -62,10 +63,10 @@ OFFSET = 1e-3
 """Of a joint, rad."""
 
 
-def with_offset(data: dc.Measurements, joint: int) -> dc.Measurements:
+def with_offset(data: dc.Measurements, joint: int, size: float = OFFSET) -> dc.Measurements:
     """Rows whose encoder of a joint reads too little."""
     q = data.q.clone()
-    q[:, joint] -= OFFSET
+    q[:, joint] -= size
     return dc.Measurements(q, data.points, data.joint_names)
 
 
@@ -87,6 +88,19 @@ def test_offsets_that_places_hide_are_named(joint: int, what: str) -> None:
 
 def test_nothing_is_hidden_where_nothing_moved() -> None:
     assert hidden_in(positions(arm(), 24, seed=5)) == ()
+
+
+def test_the_smallest_offset_that_rows_show() -> None:
+    rows = positions(arm(), 24, seed=5)
+    unchanged = dc.compare(model(positions), rows)
+    assert isinstance(unchanged, Comparison)
+    waist, _, elbow, *_ = unchanged.changes.smallest
+    assert waist.size == inf  # the device's place hides it
+    assert 2e-5 < elbow.size < 3e-4
+    for factor in (0.2, 1.5):
+        found = dc.compare(model(positions), with_offset(rows, 2, factor * elbow.size))
+        assert isinstance(found, Comparison)
+        assert [one.part for one in found.changes.found] == [f"the offset of {elbow.joint}"] * (factor > 1)
 
 
 def test_an_offset_between_two_models_is_named() -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
+import torch
+from campaigns import CAMPAIGNS
 from command_bank import FORMAT, POSITION, TABLE, Command
 from product_bank import Case, simulated
+from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -28,7 +33,7 @@ def files(arm: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]
 def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Command) -> None:
     done = command("recalibrate", files["old.safetensors"], files["new.csv"], *TABLE, "-o", files["new.safetensors"])
     assert done.code == 0
-    assert "the markers are where they were" in done.out
+    assert "the markers are taken to be where they were (these rows show that to 0.0" in done.out
     assert "no change was found but the places of device and markers" in done.out
     assert len(dc.load(files["new.safetensors"]).configurations) == 75
     compared = command("compare", files["old.safetensors"], files["new.safetensors"], "--figure", files["where.png"])
@@ -51,3 +56,41 @@ def test_a_table_needs_its_columns(files: dict[str, str], command: Command) -> N
     done = command("compare", files["old.safetensors"], files["new.csv"], "--position", POSITION)
     assert done.code == 1
     assert "--length and --angle missing" in done.error
+
+
+def written(path: Path, q: Tensor) -> str:
+    """Rows of the arm at these configurations, as a table."""
+    robot = simulated(1)[0]
+    data = dc.Measurements(q, robot.true_points(q), joint_names=robot.nominal.joint_names, doubt=False)
+    write_measurements(path, data, FORMAT, position=[POSITION.split(",")])
+    return str(path)
+
+
+def test_other_markers_that_the_rows_leave_open(files: dict[str, str], tmp_path: Path, command: Command) -> None:
+    """The tool is only turned about the vertical, which does not show how high the marker is."""
+    q = CAMPAIGNS["tool turned about the vertical"](simulated(1)[0], 12, torch.Generator().manual_seed(5))
+    table = written(tmp_path / "upright.csv", q)
+    options = *TABLE, "--marker-freedom", "other"
+    found = command("recalibrate", files["old.safetensors"], table, *options, "-o", str(tmp_path / "new.safetensors"))
+    compared = command("compare", files["old.safetensors"], table, *options)
+    for done in (found, compared):
+        assert done.code == 0
+        assert re.search(r"the place of the marker on 'flange' along \(.*\) is known to \d\d mm only", done.err)
+        assert "unmoved" not in done.out  # other markers were named
+    assert re.search(r"mm from where they were \(these rows show that to \d\d mm\), or are other ones", found.out)
+
+
+def test_rows_that_test_no_change(arm: Case, files: dict[str, str], tmp_path: Path, command: Command) -> None:
+    """Four rows of 20 lie within the old joint ranges: a change may be in the places, which nobody knows."""
+    known = arm.model.configurations
+    low, high = known.amin(0), known.amax(0)
+    q = simulated(1)[0].sample(20, seed=5).clamp(low, high)
+    q[4:, 2] = high[2] + 0.05 * (high[2] - low[2])
+    entry = tmp_path / "result.json"
+    table = written(tmp_path / "new.csv", q)
+    done = command("compare", files["old.safetensors"], table, *TABLE, "--json", str(entry))
+    assert done.code == 0
+    assert "warning: only 4 rows lie within the joint ranges that the model knows" in done.err
+    assert "a change of the robot, which was not tested, would be in them" in done.out
+    assert "unmoved" not in done.out
+    assert json.loads(entry.read_text())["results"]["rows_can_tell"] is False

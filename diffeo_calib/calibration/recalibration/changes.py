@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from math import degrees
+from math import degrees, inf
 from typing import NamedTuple
 
 import torch
@@ -26,7 +26,7 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import find_block
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import with_deviation
+from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -220,7 +220,7 @@ class Offset(ChangedPart):
         return OFFSET_DEVIATION_RAD_M * float(torch.einsum("imc,im->c", self.root(at), mu))
 
 
-def offsets_of(rows: NewRows) -> list[ChangedPart]:
+def offsets_of(rows: NewRows) -> list[Offset]:
     """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
     chain = rows.points.fitted.geometry.chain
     return [Offset(f"the offset of {name}", joint) for joint, name in enumerate(chain.joint_names)]
@@ -295,6 +295,18 @@ class Change:
         return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
+class SmallestOffset(NamedTuple):
+    """The smallest change of an offset, rad or m, shown in nine cases of ten; infinite if places hide it."""
+
+    joint: str
+    size: float
+    angle: bool
+
+    def __str__(self) -> str:
+        size = "none" if self.size == inf else f"{1e3 * self.size:.2g} {'mrad' if self.angle else 'mm'}"
+        return f"{self.joint} {size}"
+
+
 @dataclass(frozen=True)
 class Changes:
     """Changes, the clearest first.
@@ -305,6 +317,7 @@ class Changes:
         noise: standard deviation of the new rows' noise relative to that of the old rows.
         rows: number of rows that were tested: those within the old joint ranges.
         level: probability of a false alarm; None if nothing was tested on request.
+        smallest: of every joint, the smallest change of its offset that the rows would show; empty once one was found.
     """
 
     found: tuple[Change, ...]
@@ -312,20 +325,32 @@ class Changes:
     noise: float
     rows: int
     level: float | None
+    smallest: tuple[SmallestOffset, ...] = ()
 
     @classmethod
     def untested(cls) -> Changes:
         """No test was wanted."""
         return cls((), {}, 1.0, 0, None)
 
+    @property
+    def tested(self) -> bool:
+        """Whether the robot was tested: else a change of it may be in new places of device and markers."""
+        return bool(self.probabilities)
+
+    @property
+    def few(self) -> str:
+        """How many rows could be tested, in words."""
+        return f"only {self.rows} rows lie within the joint ranges that the model knows"
+
     def __str__(self) -> str:
         if self.level is None:
             return "changes of the robot were not tested"
-        if not self.probabilities:
-            return f"only {self.rows} rows lie within the joint ranges that the model knows: changes were not tested"
+        if not self.tested:
+            return f"{self.few}: changes were not tested, and what has changed is not known"
         if not self.found:
             places = "the places of device and markers, which may hide an offset of the first or the last joint"
-            return f"no change was found but {places} (tested at {100 * self.level:g} %)"
+            rows = f", {self.rows} rows" * bool(self.rows)
+            return f"no change was found but {places} (tested at {100 * self.level:g} %{rows})"
         return "; ".join(map(str, self.found))
 
 
@@ -350,8 +375,14 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
 
     Returns:
         what was found, and what may drift: nothing where only a part of the rows shows a change.
+
+    Warns:
+        DiffeoCalibWarning: too few rows within the old joint ranges for a test.
     """
     changes, drifts = _changes_of(rows, level=level, seed=seed)
+    if not changes.tested:
+        what = f"{changes.few}: changes of the robot were not tested, and the places that were found may hide one"
+        warn_user(sentence(what, fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
     groups = groups_of(rows)
     if changes.found or not groups:
         return changes, drifts
@@ -428,7 +459,24 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         for drift in drifts
     )
     probabilities = {name: ratio.probability for name, ratio in first.items()}
-    return Changes(changes, probabilities, noise, len(rows), level), drifts
+    return Changes(changes, probabilities, noise, len(rows), level, () if drifts else _smallest(rows, factor)), drifts
+
+
+SHOWN = 5.5
+"""Standard deviations of an offset that is named in nine cases of ten at a level of 1 %."""
+LARGEST_OFFSET_RAD_M = 5e-3
+"""The largest one that is tested, see SIZES."""
+
+
+def _smallest(rows: NewRows, factor: Tensor) -> tuple[SmallestOffset, ...]:
+    """See :class:`Changes`; ``factor``: Cholesky factor of the covariance of all rows."""
+    chain, found = rows.points.fitted.geometry.chain, []
+    for part in offsets_of(rows):
+        white = torch.linalg.solve_triangular(factor, part.root(rows.at).flatten()[:, None], upper=False)
+        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(white.norm())
+        size = size if size < LARGEST_OFFSET_RAD_M else inf
+        found.append(SmallestOffset(chain.joint_names[part.joint], size, chain.kinds[part.joint] != "prismatic"))
+    return tuple(found)
 
 
 def within_old_range(rows: NewRows) -> Tensor:

@@ -168,7 +168,7 @@ def compare(
     if isinstance(other, CalibratedKinematics):
         return _models(model, other, count, seed)
     check_arguments(model, other, marker)
-    before = place_again(model, other)
+    before = place_again(model, other, marker)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
     found = before.registration

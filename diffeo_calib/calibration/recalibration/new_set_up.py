@@ -114,8 +114,13 @@ class Before:
         return seen
 
 
-def place_again(model: CalibratedKinematics, new: Any) -> Before:
+def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidence") -> Before:
     """Find where device and markers are now.
+
+    Args:
+        model: the old model. new: the rows.
+        marker: how far the markers may be from where they were: in directions that the rows leave open, this is all
+            that is known of them.
 
     Raises:
         InputError: joints in another order, or markers that the model cannot be compared with.
@@ -139,7 +144,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
         own = own._replace(table=mounted_of(model).in_any_frame(table))
         device = measured_rows(own.table)
         if device is not None:
-            place, seen = _place_of_device(old, nominal, model.lever, device.table)
+            place, seen = _place_of_device(old, nominal, model.lever, device.table, REGISTERED_M.get(marker))
             geometry = _in_frame(old, nominal, place.registration.transform)
             sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
@@ -166,7 +171,7 @@ def _check_robot(model: CalibratedKinematics, new: Any) -> None:
 
 
 def _place_of_device(
-    old: FittedMap, nominal: GeometryMap, lever: float | None, device: Measurements
+    old: FittedMap, nominal: GeometryMap, lever: float | None, device: Measurements, marker_std: float | None
 ) -> tuple[FoundPlace, Tensor]:
     """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
 
@@ -175,7 +180,7 @@ def _place_of_device(
 
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
-    place = find_place(old, nominal, lever, largest)
+    place = find_place(old, nominal, lever, largest, marker_std=marker_std)
     check_place(place.registration)
     T = place.registration.transform
     return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
@@ -235,6 +240,8 @@ def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None
 
 
 Marker = Literal["evidence", "same", "moved", "other"]
+REGISTERED_M: dict[str, float] = {"moved": PLACES.remounted_m, "other": PLACES.other_registered_m}
+"""Prior standard deviations of the markers in the registration, m. Else the rows choose: they judge "same", too."""
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
 LARGEST_RATIO = 5.0

@@ -79,6 +79,8 @@ class Recalibration:
         after: the same from the new model.
         left_out: the same, each new row predicted by the old ones and the other new ones. Of each ``rms_before``,
             ``rms_after`` and ``left_out_rms`` are the RMS of measured positions, m, see :attr:`Evaluations.rms`.
+        shift: (P, 3) of the markers from where the old model has them to where the new one does, in the frames of
+            their tips, m; zero for those that no device showed again. None where no device measured coordinates.
         hidden: offsets that explain new places of device or markers as well, where no change is named.
         inflation: factor on all variances of the old scales with which regions hold the new rows, at least one.
         fit: the exact model's fit with its certificates.
@@ -96,6 +98,7 @@ class Recalibration:
     left_out: Evaluations
     inflation: float
     fit: Fit
+    shift: Tensor | None = None
     hidden: tuple[HiddenOffset, ...] = ()
 
     rms_before = property(lambda self: self.before.rms)
@@ -161,7 +164,7 @@ def recalibrate(
     check_note(note)
     check_seed(seed)
     progress("registration", 0, 1)
-    before = place_again(model, new)
+    before = place_again(model, new, marker)
     rows = weighed(before, marker)
     LOG.info("registration: RMS %s of %d new rows", rows.by_kind(rows.placed_residual).rms_text, len(new))
     progress("changes", 0, 1)
@@ -221,6 +224,7 @@ def _result(
         left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
+        shift=None if found is None else (again.geometry.tool - place.own_markers) * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place, changes),
     )
 

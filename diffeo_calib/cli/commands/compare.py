@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
-from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry, offsets_entry
+from diffeo_calib.cli.commands.recalibrate import (
+    change_lines,
+    changes_entry,
+    doubt,
+    offsets_entry,
+    smallest_entry,
+    smallest_lines,
+)
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.printed import motion_lines
@@ -39,20 +46,22 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
         return
     record.add(
         changes=changes_entry(found.changes),
+        smallest_offsets=smallest_entry(found.changes),
         possible_offsets=offsets_entry(found.hidden),
-        rows_can_tell=found.telling,
+        rows_can_tell=found.telling and found.changes.tested,
         **({} if found.moved is None else {"transform": found.moved.transform}),
         **entries_by_kind(
             {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
         ),
     )
     for line in (
-        () if found.moved is None else motion_lines(found.moved, model.on, robot_changed=bool(found.changes.found))
+        () if found.moved is None else motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them"))
     ):
         say(line)
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
-    for line in change_lines(found.changes) if found.changes.found else [str(found)]:
+    told = [str(found), *smallest_lines(found.changes)]
+    for line in change_lines(found.changes) if found.changes.found else told:
         say(line)
 
 

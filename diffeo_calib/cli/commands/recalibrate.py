@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
 import typer
@@ -48,6 +49,8 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
         changes=changes_entry(result.changes),
+        rows_can_tell=result.changes.tested,
+        smallest_offsets=smallest_entry(result.changes),
         possible_offsets=offsets_entry(result.hidden),
         markers=result.marker,
         **({} if result.moved is None else {"transform": result.moved.transform}),
@@ -73,10 +76,17 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
 
 def _found(result: Recalibration) -> list[str]:
     """Errors of the new rows, and those that hardly count."""
-    shift = None if result.moved is None else result.moved.shift
-    moved = "have moved" if shift is None else f"have moved by {1e3 * float(shift.norm(dim=1).max()):.2g} mm"
-    moved += ", or the change below is in this" * bool(result.changes.found)
-    markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
+    moved, known = "have moved", ""
+    if result.moved is not None and result.shift is not None:
+        moved = f"are {1e3 * float(result.shift.norm(dim=1).max()):.2g} mm from where they were"
+        known = f" (these rows show that to {1e3 * result.moved.known_m:.2g} mm)"
+    known *= result.changes.tested
+    moved += known + doubt(result.changes, "in this")
+    markers = {
+        "same": f"are taken to be where they were{known}",
+        "moved": moved,
+        "other": f"{moved}, or are other ones",
+    }
     placed = [] if any("markers" in one.instead for one in result.hidden) else [f"the markers {markers[result.marker]}"]
     lines = [
         *placed,
@@ -88,6 +98,13 @@ def _found(result: Recalibration) -> list[str]:
             f"{len(result.outliers)} row(s) hardly count: row {few(result.outliers)}: measure these poses again"
         )
     return lines
+
+
+def doubt(changes: Changes, where: str) -> str:
+    """What a change of the robot does to places that were found without one."""
+    if changes.found:
+        return f": a part of the change below is {where}"
+    return "" if changes.tested else f": a change of the robot, which was not tested, would be {where}"
 
 
 def changes_entry(changes: Changes) -> list[dict[str, object]]:
@@ -105,4 +122,17 @@ def offsets_entry(hidden: Sequence[HiddenOffset]) -> list[dict[str, object]]:
 
 def change_lines(changes: Changes) -> list[str]:
     """Changes, one line each."""
-    return [f"  {change}" for change in changes.found] or [str(changes)]
+    return [f"  {change}" for change in changes.found] or [str(changes), *smallest_lines(changes)]
+
+
+def smallest_lines(changes: Changes) -> list[str]:
+    """Which offsets the rows would have shown, where they show no change."""
+    if not changes.smallest:
+        return []
+    listed = ", ".join(map(str, changes.smallest))
+    return [f"smallest change of an offset that these rows would show in nine cases of ten: {listed}"]
+
+
+def smallest_entry(changes: Changes) -> list[dict[str, object]]:
+    """The same for programs; None where places hide it."""
+    return [{"joint": one.joint, "size_rad_or_m": one.size if isfinite(one.size) else None} for one in changes.smallest]

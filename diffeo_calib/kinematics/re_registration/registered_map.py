@@ -110,6 +110,12 @@ class Registration:
         """(P, 3) standard deviations of the markers in the tip's frame, m."""
         return self.covariance.diagonal()[6:].clamp(min=0).sqrt().unflatten(0, (-1, 3))
 
+    @property
+    def known_m(self) -> float:
+        """Standard deviation of the markers in the direction in which the rows show them least, m."""
+        blocks = self.covariance[6:, 6:].unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2)
+        return float(torch.linalg.eigvalsh(blocks.movedim(-1, 0)).max().clamp(min=0).sqrt())
+
 
 class RegisteredMap(FittedMap):
     """T o k1 of the markers of a registration.
