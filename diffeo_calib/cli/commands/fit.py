@@ -172,13 +172,13 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    advice = next(filter(None, (one.size_advice() for one in result.placement.sets)), None)
-    share, whole = result.expected.size_share, 1e3 * result.expected.workspace
-    if advice is not None and share > LARGE_SHARE:
-        yield f"  the robot's size is {share * whole:.3f} mm of the expected error of {whole:.3f} mm: {advice}"
     if any(one.one.what == ERRORS for one in (held_out or {}).values()):  # else they are the verdict
         yield stage_line(result.model, result.stages, result.expected)
     yield from expectation_lines(result.model, data, result.expected)
+    advice = next(filter(None, (one.size_advice() for one in result.placement.sets)), None)
+    share, whole = result.expected.size_share, 1e3 * result.expected.workspace
+    if advice is not None and share > LARGE_SHARE:
+        yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
