@@ -238,8 +238,9 @@ def correct_command(
     The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
     --position (and --rotation) it is read from the table, and the joint values are where the search starts.
 
-    Writes the program with corrected joint values, and adds the pose (command_x, ...) to send to a controller that does
-    its own nominal inverse kinematics, the status of each row and its miss. Rows that cannot reach their targets get
+    Writes the program with corrected joint values, and adds the pose (command_x, ...) of the tool in the URDF's base
+    link, for a controller that does its own nominal inverse kinematics, the status of each row, its miss and how well
+    the model knows the tool there (std_mm). Rows that cannot reach their targets get
     the nearest command that is allowed, and are listed; the exit code is 0 then, too. Joint cells stay empty where no
     command is allowed.
 

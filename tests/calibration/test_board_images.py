@@ -112,8 +112,10 @@ def test_a_board_of_nearly_the_right_size_is_named() -> None:
     wrong[..., :3] *= 0.988
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DiffeoCalibWarning)
-        dc.calibrate(arm().arm.nominal, of_corners(wrong), hyperparameters=SCALES)
+        found = dc.calibrate(arm().arm.nominal, of_corners(wrong), hyperparameters=SCALES)
     assert any("size of the board" in str(one.message) for one in caught)
+    assert any(line.startswith("not decided: lengths that differ by 1.") for line in found.placement.sentences())
+    assert not any(line.startswith("not decided") for line in calibrated().placement.sentences())
 
 
 def test_images_in_another_order_are_refused() -> None:

@@ -77,7 +77,7 @@ def test_a_program_of_commands(
     before, after = cells(program), cells(output)
     names, robot = list(site.arm.nominal.joint_names), site.arm.nominal
     added = ["command_x", "command_y", "command_z", "command_rx", "command_ry", "command_rz"]
-    added += ["status", "miss_mm", "angle_miss_deg"]
+    added += ["status", "miss_mm", "angle_miss_deg", "std_mm"]
     assert list(after[0]) == ["line", *names, "note", *added]
     assert [(row["line"], row["note"]) for row in after] == [(row["line"], row["note"]) for row in before]
     old, new = (torch.from_numpy(np.radians(table(rows, names))) for rows in (before, after))
@@ -89,6 +89,9 @@ def test_a_program_of_commands(
     assert float(angle_between(intended[:, :3, :3], found[:, :3, :3])[reached].max()) < 1e-9
     np.testing.assert_allclose(table(after, ["miss_mm"])[:, 0], 1e3 * distance.numpy(), atol=1e-8)
     torch.testing.assert_close(poses_of(after, "command_"), robot(new) @ tool_frame(), rtol=0, atol=1e-12)
+    covariance = model.predict_tool_poses(new, tool_frame())[1].diagonal(dim1=1, dim2=2)[:, :3].sum(1)
+    np.testing.assert_allclose(table(after, ["std_mm"])[:, 0], 1e3 * covariance.sqrt().numpy(), rtol=1e-6)
+    assert f"in the frame of {robot.base}" in done.out
     assert f"12 rows: {int(reached.sum())} reached" in done.out
     largest = float((robot(new) @ tool_frame() - robot(old) @ tool_frame())[:, :3, 3].norm(dim=1).max())
     assert f"{1e3 * largest:.4f}" in done.out
@@ -127,7 +130,9 @@ def test_target_poses_in_another_convention(site: Site, program: Path, tmp_path:
     path = site.folder / "model.safetensors"
     assert command("correct", path, program, *UNITS, "--convention", "ZYX", "-o", tmp_path / "first.csv").code == 0
     turns = "command_euler1,command_euler2,command_euler3"
-    text = (tmp_path / "first.csv").read_text().replace("status", "was").replace("miss", "was_miss")
+    text = (tmp_path / "first.csv").read_text()
+    for name in ("status", "miss", "std"):
+        text = text.replace(name, f"was_{name}")
     (tmp_path / "targets.csv").write_text(text.replace("command_", "goal_"))
     options = [*UNITS, "--position", "goal_x,goal_y,goal_z", "--rotation", turns.replace("command", "goal")]
     options += ["--convention", "ZYX", "--rotation-angle", "deg", "--limit", "3"]

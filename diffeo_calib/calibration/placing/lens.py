@@ -94,12 +94,14 @@ class LensAndBoard(CameraErrors):
         on_tool: whether the camera is on the tool, else the board. lever: of the poses, m.
         apart: (M, 9, c) the same effects apart from the places of the robot and of what is on the tool.
         explained: at the tool, by the rows of each camera; what the fit says is zero before it.
+        larger: see :func:`relative_size`.
     """
 
     on_tool: bool
     lever: float
     apart: Tensor
     explained: tuple[Explained, ...]
+    larger: float
 
     @classmethod
     def of_table(
@@ -126,18 +128,19 @@ class LensAndBoard(CameraErrors):
             apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             on_tool = data.board is not None
-            found.append(
-                cls(shared, rows, on_tool, data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained))
-            )
-            found[-1].check_size(relative_size(data, rows, registration, sessions))
+            larger = relative_size(data, rows, registration, sessions)
+            own = data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained), larger
+            found.append(cls(shared, rows, on_tool, *own))
+            found[-1].check_size()
         return found
 
-    def check_size(self, larger: float) -> None:
-        """Compare the board's lengths with those of the robot as described, see :func:`relative_size`.
+    def check_size(self) -> None:
+        """Compare the board's lengths with those of the robot as described.
 
         Raises:
             MeasurementError: a board of another size than was said. Warns: lengths that differ less.
         """
+        larger = self.larger
         if abs(larger) < SIZE_WARNED:
             return
         what = "the size of the board does not fit that of the robot"
@@ -184,7 +187,17 @@ class LensAndBoard(CameraErrors):
 
     def sentences(self) -> list[str]:
         """See :class:`DeviceSet`."""
-        return list(camera_sentences(dict(zip(self.shared.cameras, self._cameras, strict=True))))
+        lines = list(camera_sentences(dict(zip(self.shared.cameras, self._cameras, strict=True))))
+        if abs(self.larger) >= SIZE_WARNED:
+            lines.append(
+                f"not decided: lengths that differ by {100 * abs(self.larger):.1f} % are counted with the arm, but the "
+                "board's size explains them as well, until its squares are measured"
+            )
+        return lines
+
+    def size_advice(self) -> str:
+        """See :class:`DeviceSet`."""
+        return "measure the printed squares with a caliper and give `images --board-std`"
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""

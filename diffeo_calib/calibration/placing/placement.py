@@ -168,6 +168,10 @@ class DeviceSet(ABC):
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
+    def size_advice(self) -> str:
+        """What would make the robot's size better known; nothing where these devices have a size of their own."""
+        return ""
+
     def labels(self, own: Coordinates, seen: Tensor) -> Iterable[OtherLabel]:
         """How rows that tell coordinates would err under other names of devices; ``seen`` (N, P, 3) by the model, m."""
         return ()

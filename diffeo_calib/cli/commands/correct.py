@@ -29,8 +29,8 @@ from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.tree import Tree
 
 AXES_OF_A_POSE = 6
-MOST_PREDICTED = 100
-"""Most rows whose deviations are predicted."""
+ROWS_AT_ONCE = 100
+"""Rows whose deviations are predicted together."""
 MOST_MISSED = 10
 """Most lines about rows that are not reached."""
 
@@ -47,6 +47,14 @@ class ToolOnTip:
         """Poses (N, 4, 4) of the tool where the robot has no errors, m."""
         poses = robot(q)
         return (poses if poses.ndim == 3 else poses[:, robot.tips.index(self.tip)]) @ self.tool
+
+    def known(self, model: CalibratedKinematics, q: Tensor, frame: str) -> tuple[Tensor, Tensor]:
+        """Standard deviations (N, 2) of its poses, m and rad: in the frame, and apart from where base and tool sit."""
+        whole, apart = [], []
+        for rows in q.split(ROWS_AT_ONCE):
+            whole.append(_deviations(model.predict_tool_poses(rows, self.tool, frame, self.tip)[1]))
+            apart.append(_deviations(covariance_without_placement(model, rows, self.tool, self.tip)))
+        return torch.cat(whole), torch.cat(apart)
 
     def own(self, values: Tensor) -> Tensor:
         """Its own part of a result."""
@@ -79,6 +87,7 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     oriented = targets is None or targets.ndim == 4
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
     sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
+    sheet.check_free([tool.name("std", table.length) for tool in tools])
     warn_outside_range(kinematics, start, refuse_other_unit=True)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
@@ -89,12 +98,19 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
         progress("commands", 0, 1)
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
-    sheet.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
+    allowed = found.q.isfinite().all(1)
+    known = [tool.known(kinematics, found.q[allowed], options.frame.value) for tool in tools if bool(allowed.any())]
+    sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
     record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)
-    for tool in tools:
-        _say_how_well_known(kinematics, found, tool, options.frame.value)
-    say(f"{len(found)} rows written to {output}: corrected joints, pose to command, status and miss")
+    where = "robot's base" if options.frame.value == "base" else "measuring frame"
+    for tool, each in zip(tools, known, strict=False):
+        say(_how_well_known(tool, *each, where))
+    frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
+    say(
+        f"{len(found)} rows written to {output}: corrected joints, the pose to command ({frames}), status, miss and "
+        "standard deviation"
+    )
 
 
 def _check(options: Correction) -> None:
@@ -158,7 +174,11 @@ def _miss_names(tool: ToolOnTip, table: TableFormat, *, oriented: bool) -> list[
 
 
 def _added(
-    model: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], table: TableFormat
+    model: CalibratedKinematics,
+    found: Compensation,
+    tools: list[ToolOnTip],
+    known: list[tuple[Tensor, Tensor]],
+    table: TableFormat,
 ) -> dict[str, Column]:
     """The columns beside those of the program; poses and misses are NaN where there is no command or no target."""
     added: dict[str, Column] = {}
@@ -179,6 +199,10 @@ def _added(
         if found.angle_miss is not None:
             angle = tool.own(found.angle_miss)
             added[names[1]] = (angle.rad2deg() if table.angle == "deg" else angle).tolist()
+    for tool, (whole, _) in zip(tools, known, strict=False):
+        deviations = torch.full((len(found),), torch.nan, dtype=torch.float64, device=found.q.device)
+        deviations[allowed] = whole[:, 0] * table.per_metre
+        added[tool.name("std", table.length)] = deviations.tolist()
     return added
 
 
@@ -222,28 +246,29 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
         warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
 
 
-def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: ToolOnTip, frame: str) -> None:
-    """Print the deviations with which the model knows the tool at the commands: a miss of zero is one on the model."""
-    q = found.q[found.q.isfinite().all(1)]
-    if not len(q):
-        return
-    some = q[
-        torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), dtype=torch.float64, device=q.device).round().long()
-    ]
-    _, covariance = model.predict_tool_poses(some, tool.tool, frame, tool.tip)
-    where = "robot's base" if frame == "base" else "measuring frame"
-    known, alone = _sizes(covariance), _sizes(covariance_without_placement(model, some, tool.tool, tool.tip))
-    say(
-        f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to {known[0]}, and "
-        f"its orientation to {known[1]} (standard deviations); apart from where the base stands and how the tool sits "
-        f"on its flange, which are the same for all commands and can be taught anew, to {alone[0]} and {alone[1]}"
+def _how_well_known(tool: ToolOnTip, whole: Tensor, apart: Tensor, where: str) -> str:
+    """How well the model knows a tool, by deviations (N, 2) as of :meth:`ToolOnTip.known`: misses are the model's."""
+    said = (
+        f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to "
+        f"{_sizes(whole)[0]}, and its orientation to {_sizes(whole)[1]} (standard deviations)"
+    )
+    if float(apart.square().sum(0)[0]) >= float(whole.square().sum(0)[0]):  # as far from the rows of the fit
+        return said
+    return (
+        f"{said}; apart from where the base stands and how the tool sits on its flange, which are the same for all "
+        f"commands and can be taught anew, to {_sizes(apart)[0]} and {_sizes(apart)[1]}"
     )
 
 
-def _sizes(covariance: Tensor) -> tuple[str, str]:
-    """Root mean square deviations of positions and orientations, of covariances (M, 6, 6) in m and rad."""
-    variances = covariance.diagonal(dim1=1, dim2=2).mean(0).clamp(min=0.0)
-    shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))
+def _deviations(covariance: Tensor) -> Tensor:
+    """Standard deviations (M, 2) of positions and orientations, m and rad, of covariances (M, 6, 6)."""
+    variances = covariance.diagonal(dim1=1, dim2=2).clamp(min=0.0)
+    return torch.stack([variances[:, :3].sum(1), variances[:, 3:].sum(1)], 1).sqrt()
+
+
+def _sizes(deviations: Tensor) -> tuple[str, str]:
+    """Root mean squares over rows (M, 2) of positions and orientations."""
+    shift, turn = deviations.square().mean(0).sqrt().tolist()
     return f"{1e3 * shift:.3f} mm", f"{degrees(turn):.4f} deg"
 
 

@@ -41,6 +41,8 @@ from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
+LARGE_SHARE = 0.5
+"""Of the expected error, from which the robot's size is said to be worth measuring."""
 
 Errors = dict[str, KindErrors]
 """Errors of every stage by the kind of rows."""
@@ -173,6 +175,10 @@ def _lines_about_places(
     if any(one.one.what == ERRORS for one in (held_out or {}).values()):  # else they are the verdict
         yield stage_line(result.model, result.stages, result.expected)
     yield from expectation_lines(result.model, data, result.expected)
+    advice = next(filter(None, (one.size_advice() for one in result.placement.sets)), None)
+    share, whole = result.expected.size_share, 1e3 * result.expected.workspace
+    if advice is not None and share > LARGE_SHARE:
+        yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
