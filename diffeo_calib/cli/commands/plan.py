@@ -105,7 +105,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
 def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
     """Expected error over the joint ranges of the fit, and why that of the plan differs."""
     if isinstance(source, CalibratedKinematics):
-        yield "the table is of the poses drawn or given, perhaps beyond the fit's, and counts what its rows leave open"
+        yield "the table averages over the poses that were drawn or given; they may lie beyond those of the fit"
         yield from expectation_lines(source, None)
 
 
