@@ -109,6 +109,9 @@ def test_an_offset_between_two_models_is_named() -> None:
         new = dc.calibrate(arm().nominal, data, hyperparameters=usual_scales(arm().nominal)).model
         compared = dc.compare(old, new, count=100)
         assert isinstance(compared, ModelComparison)
+        ratio = compared.rms / compared.expected
+        assert 1.0 / 1.5 < ratio < 1.5 if not joints else ratio > 3.0  # a change does not explain itself
+        assert f"{ratio:.1f} times the" in str(compared)
         found = compared.changes.found
         assert [one.part for one in found] == [f"the offset of {arm().nominal.joint_names[joint]}" for joint in joints]
         for one in found:
