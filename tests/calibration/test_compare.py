@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 import torch
 from again_bank import arm, model, positions
+from campaigns import CAMPAIGNS
 from product_bank import usual_scales
 from torch import Tensor
 from torch.distributions import MultivariateNormal
@@ -118,6 +119,17 @@ def test_an_offset_between_two_models_is_named() -> None:
             assert one.deviation is not None
             assert one.size == pytest.approx(OFFSET, abs=4 * one.deviation)
             assert one.part in str(compared)
+
+
+def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
+    """With a tool that only turns about the vertical its height is open, by decimetres, and found anew."""
+    q = CAMPAIGNS["tool turned about the vertical"](arm(), 30, torch.Generator().manual_seed(3))
+    rows = dc.Measurements(q, arm().true_points(q), doubt=False)
+    with pytest.warns(dc.DiffeoCalibWarning, match="the place of the marker"):
+        old = dc.calibrate(arm().nominal, rows, hyperparameters=usual_scales(arm().nominal)).model
+    compared = dc.compare(old, model(positions), count=100)
+    assert isinstance(compared, ModelComparison)
+    assert compared.expected < 1e-3
 
 
 def test_ratios_are_those_of_the_definition() -> None:
