@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from math import inf
 from types import SimpleNamespace
 from typing import Any, cast
@@ -125,7 +126,8 @@ def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
     """With a tool that only turns about the vertical its height is open, by decimetres, and found anew."""
     q = CAMPAIGNS["tool turned about the vertical"](arm(), 30, torch.Generator().manual_seed(3))
     rows = dc.Measurements(q, arm().true_points(q), doubt=False)
-    with pytest.warns(dc.DiffeoCalibWarning, match="the place of the marker"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)  # of what is open
         old = dc.calibrate(arm().nominal, rows, hyperparameters=usual_scales(arm().nominal)).model
     compared = dc.compare(old, model(positions), count=100)
     assert isinstance(compared, ModelComparison)
