@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from math import inf
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,6 +11,7 @@ from typing import Any, cast
 import pytest
 import torch
 from again_bank import arm, model, positions
+from campaigns import CAMPAIGNS
 from product_bank import usual_scales
 from torch import Tensor
 from torch.distributions import MultivariateNormal
@@ -109,12 +111,27 @@ def test_an_offset_between_two_models_is_named() -> None:
         new = dc.calibrate(arm().nominal, data, hyperparameters=usual_scales(arm().nominal)).model
         compared = dc.compare(old, new, count=100)
         assert isinstance(compared, ModelComparison)
+        ratio = compared.rms / compared.expected
+        assert 1.0 / 1.5 < ratio < 1.5 if not joints else ratio > 3.0  # a change does not explain itself
+        assert f"{ratio:.1f} times the" in str(compared)
         found = compared.changes.found
         assert [one.part for one in found] == [f"the offset of {arm().nominal.joint_names[joint]}" for joint in joints]
         for one in found:
             assert one.deviation is not None
             assert one.size == pytest.approx(OFFSET, abs=4 * one.deviation)
             assert one.part in str(compared)
+
+
+def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
+    """With a tool that only turns about the vertical its height is open, by decimetres, and found anew."""
+    q = CAMPAIGNS["tool turned about the vertical"](arm(), 30, torch.Generator().manual_seed(3))
+    rows = dc.Measurements(q, arm().true_points(q), doubt=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)  # of what is open
+        old = dc.calibrate(arm().nominal, rows, hyperparameters=usual_scales(arm().nominal)).model
+    compared = dc.compare(old, model(positions), count=100)
+    assert isinstance(compared, ModelComparison)
+    assert compared.expected < 1e-3
 
 
 def test_ratios_are_those_of_the_definition() -> None:

@@ -23,6 +23,7 @@ from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
@@ -35,6 +36,8 @@ GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
 OFFSET_ROWS = 60
 """Configurations that show which joint offsets differ between two models."""
+CHUNK = 200
+"""Configurations whose joint covariance is computed at once."""
 MOST_CONFIGURATIONS = 100_000
 MOST_USUAL = 100
 """Rows of the fit that show how certain a model is there."""
@@ -90,7 +93,8 @@ class ModelComparison:
 
     Args:
         q: (N, n) configurations. difference: (N, P, 3) second minus first, m.
-        deviation: (N, P) standard deviation of the length of this difference as both models claim it, m.
+        deviation: (N, P) standard deviation of the length of this difference as both models claim it, m, if they are of
+            an unchanged robot and share no rows.
         transmissions: name of each joint -> RMS difference of its transmission errors over its range, rad or m.
         geodesic_length: length of the geodesic of deformations that leads from the first to the second: the root of the
             sum of squares of its parts in units of their prior standard deviations. Zero for equal models.
@@ -113,7 +117,7 @@ class ModelComparison:
 
     @property
     def expected(self) -> float:
-        """The RMS length that both models' uncertainties lead to expect, m."""
+        """The RMS length that both models' uncertainties lead to expect, m: too large where they share rows."""
         return float(self.deviation.square().mean().sqrt())
 
     @property
@@ -122,13 +126,13 @@ class ModelComparison:
         return float(self.difference.norm(dim=-1).max())
 
     def __str__(self) -> str:
-        more = "more than" if self.rms > self.expected else "no more than"
-        return (
-            f"{words_of_mass(self.payload)}the models differ by {1e3 * self.rms:.3f} mm RMS "
-            f"(at most {1e3 * self.largest:.3f} mm), {more} "
-            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
-            f"geodesic length {self.geodesic_length:.2f}{''.join(f'; {one}' for one in self.changes.found)}"
-        )
+        offsets = "; ".join(map(str, self.changes.found))
+        usual = "about 1 if nothing has changed, less if they share rows; no change of a joint offset was found"
+        differ = f"the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm)"
+        explained = f"{self.rms / self.expected:.1f} times the {1e3 * self.expected:.3f} mm that uncertainties explain"
+        why = f"beyond chance: {offsets}" if offsets else usual
+        length = f"geodesic length {self.geodesic_length:.2f}"
+        return f"{words_of_mass(self.payload)}{differ}, {explained} ({why}); {length}"
 
     def __repr__(self) -> str:
         return f"ModelComparison({len(self.q)} configurations: {self})"
@@ -203,16 +207,36 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
     first, second = under_mass(first, payload), under_mass(second, payload)
     q = _common_configurations(first, second, count, seed)
     placed = _in_place_of(second, first, q[: len(q) // 5])
-    mean, covariance = first.predict(q, noise=False)
-    other_mean, other = placed.posterior(q, noise=False)
-    variances = other.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 3)).sum(-1)
-    deviation = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + variances).sqrt()
+    other_mean, some = placed(q).detach(), slice(OFFSET_ROWS)
+    difference = other_mean - first(q).detach().flatten(1)
+    slopes = placed.place_slopes(q).unflatten(0, difference.shape)
+    found_by = torch.linalg.pinv(slopes[some].flatten(0, 1))
+    difference = difference - slopes @ (found_by @ difference[some].flatten())
+    variances = _variances(first.map, placed, q, slopes @ found_by)
     transmissions = {name: _transmission(first, second, name, q) for name in first.robot.joint_names}
     length = _geodesic_length(first, q[:GEODESIC_ROWS], other_mean[:GEODESIC_ROWS])
-    difference = other_mean.unflatten(1, (-1, 3)) - mean
-    some = slice(OFFSET_ROWS)
-    changes = changed_offsets(first.robot, first.map, placed, q[some], difference[some].flatten(1))
-    return ModelComparison(q, difference, deviation, transmissions, length, changes, payload)
+    changes = changed_offsets(first.robot, first.map, placed, q[some], difference[some])
+    deviation = variances.unflatten(1, (-1, 3)).sum(-1).sqrt()
+    return ModelComparison(q, difference.unflatten(1, (-1, 3)), deviation, transmissions, length, changes, payload)
+
+
+def _variances(first: FittedMap, placed: RegisteredMap, q: Tensor, places: Tensor) -> Tensor:
+    """Variances (N, m) of the difference of two maps at q, m^2: of both, but for what other places take out of it.
+
+    The covariance of the registration would not do: it is wider the more the models differ.
+
+    Args:
+        first, placed: the maps. q: (N, n).
+        places: (N, m, F m) how the first F configurations move the others when device and markers are placed by them.
+    """
+    found, count = [], places.shape[2] // places.shape[1]
+    for rows, by_places in zip(q.split(CHUNK), places.split(CHUNK), strict=True):
+        x = torch.cat([q[:count], rows])
+        K = first.joint_covariance(x) + FittedMap.joint_covariance(placed, x)
+        own = torch.eye(by_places.shape[:2].numel(), dtype=K.dtype, device=K.device)
+        A = torch.cat([-by_places.flatten(0, 1), own], 1)
+        found.append(((A @ K) * A).sum(1).clamp(min=0.0).view(by_places.shape[:2]))
+    return torch.cat(found)
 
 
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
