@@ -114,12 +114,7 @@ class CalibratedKinematics:
 
     @property
     def own_frame(self) -> bool:
-        """Whether positions are in a frame of the model's own, which no device measured.
-
-        So it is where all rows are readings (distances, heights, images) or a ball in sockets, until the model is
-        registered with measured positions (:meth:`registered`). Positions and covariances hold up to one rigid motion
-        of all points; predicted readings do not depend on it.
-        """
+        """Whether no device measured positions, only readings or a ball in sockets: see :meth:`predict`."""
         return self.map.workspace is not None and self.registration is None
 
     @property
@@ -404,10 +399,9 @@ class CalibratedKinematics:
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """Markers (N, P, 3) in m and their covariances (N, P, 3, 3) in m^2; see :meth:`FittedMap.predict`.
 
-        Positions are in the measuring frame. If no device measured one (:attr:`own_frame`), they are in the model's own
-        frame, and neither they nor the covariances say where that is in your world: regions hold true points only
-        after the best rigid motion of all of them. Register the model with measured positions to have them in the
-        device's frame (:meth:`registered`), or use :meth:`predict_readings` and distances between points.
+        Positions are in the measuring frame. If no device measured one (:attr:`own_frame`), they are in the model's
+        own: then neither they nor the covariances, also without noise, say where that is in your world, and regions
+        hold true points only after one rigid motion of all. :meth:`registered` with positions finds it.
 
         Args:
             q: (N, n) joint configurations.
@@ -426,9 +420,7 @@ class CalibratedKinematics:
         Returns:
             one entry for every device, and for markers that were mounted anew (their positions); none for a model of
             positions or poses alone, see :meth:`predict`.
-
-        Warns:
-            DiffeoCalibWarning: devices of a kind that is not registered in this session, which are left out.
+            Devices of a kind that is not registered in this session are left out, with a warning.
         """
         return predicted_readings(self, self._joints(q).detach(), noise=noise)
 

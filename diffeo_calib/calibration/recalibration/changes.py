@@ -234,8 +234,7 @@ def parts_of(rows: NewRows) -> list[ChangedPart]:
     least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
     found: list[ChangedPart] = []
     for joint, term in own.items() if least > 0 else ():
-        config = term.to_config() | {"variance": max(float(term.variance), least)}
-        kernel = RadialKernel.from_config(config, lambda _, own=term.profile: own)
+        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
         found.append(Transmission(chain.joint_names[joint], joint, kernel))
     every = torch.arange(len(prior), device=prior.device)
     groups = {"gravity": every[nominal.sag], "geometry": every[nominal.geometry.slices["joints"]]}
