@@ -28,6 +28,7 @@ from diffeo_calib.interop.model_header import (
     rebuild,
 )
 from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.profiles import Profile, check_profile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
 LOG = logging.getLogger(__name__)
@@ -63,38 +64,69 @@ def load(
     Args:
         path: the file.
         nominal: the nominal map, for a model of a plain function; files of robots contain theirs.
-        kernels: kernel classes that are not part of the package, by class name; files contain the names and arguments
-            of such kernels, but not their code.
+        kernels: what is not part of the package, since files contain no code: kernel classes by class name, whose
+            arguments are in the file, and profiles by their ``name`` with the parameters of the fit, such as
+            ``{"rq": RationalQuadratic(2.5)}``; a class of profiles is called without arguments.
 
     Returns:
         the model, bit for bit equal to the saved one on the same machine.
 
     Raises:
         ModelFileError: a missing, truncated or edited file, another format version, or not a model file.
-        InputError: ``nominal`` is missing, or passed for a robot; a class is missing in ``kernels``.
+        InputError: ``nominal`` is missing, or passed for a robot; a class or profile is missing in ``kernels``, or the
+            profile has other values than that of the fit.
+
+    Warns:
+        DiffeoCalibWarning: devices of a kind that nobody registered here, whose readings are not predicted; a profile
+            in a file of an old version, which cannot be compared with the one passed.
     """
-    _check_classes(kernels)
+    known = _checked(kernels)
     header, tensors = read(Path(path))
     try:
-        return rebuild(header, tensors, nominal, kernels or {})
+        model = rebuild(header, tensors, nominal, known)
     except (ModelFileError, MissingArgumentError):
         raise
     except (*UNSOUND, DiffeoCalibError) as error:
         raise ModelFileError.of(
             f"{path} has contents that do not fit together ({error})", fix="save the model again"
         ) from error
+    for own in model.placement if isinstance(model, CalibratedKinematics) else ():
+        own.warn_if_unknown()
+    return model
 
 
-def _check_classes(kernels: object) -> None:
-    """Raise InputError unless these are classes of kernels by name, or None."""
+def _checked(kernels: object) -> KernelClasses:
+    """Classes of kernels and profiles by their names; classes of profiles are called without arguments.
+
+    Raises:
+        InputError: something else, or a profile with wrong derivatives.
+    """
     if kernels is None:
-        return
-    classes = list(kernels.values()) if isinstance(kernels, Mapping) else [kernels]
-    if not isinstance(kernels, Mapping) or not all(isinstance(c, type) and issubclass(c, Kernel) for c in classes):
-        fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}"
-        raise InputError.of(
-            "`kernels`", expected="names -> subclasses of dc.Kernel", got=as_written(kernels)[:80], fix=fix
-        )
+        return {}
+    if not isinstance(kernels, Mapping) or not all(map(_is_kernel, kernels.values())):
+        fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}, or {'my_profile': MyProfile(2.5)}"
+        expected = "names -> subclasses of dc.Kernel, or profiles"
+        raise InputError.of("`kernels`", expected=expected, got=as_written(kernels)[:80], fix=fix)
+    return {name: _made(given) if _is_profile(given) else given for name, given in kernels.items()}
+
+
+def _is_profile(given: object) -> bool:
+    return isinstance(given, Profile) or (isinstance(given, type) and issubclass(given, Profile))
+
+
+def _is_kernel(given: object) -> bool:
+    return _is_profile(given) or (isinstance(given, type) and issubclass(given, Kernel))
+
+
+def _made(given: Profile | type[Profile]) -> Profile:
+    """A profile whose derivatives are right, of a class without arguments."""
+    try:
+        profile = given() if isinstance(given, type) else given
+    except TypeError as error:
+        fix = "pass the profile with the parameters of the fit, such as kernels={'my_profile': MyProfile(2.5)}"
+        raise InputError.of(f"`kernels`: {as_written(given)} needs arguments ({error})", fix=fix) from error
+    check_profile(profile)
+    return profile
 
 
 def read(path: Path) -> tuple[Header, Tensors]:

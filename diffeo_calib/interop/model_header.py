@@ -20,12 +20,13 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_covariance, check_number, positive
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, ModelFileError, few
+from diffeo_calib.common.errors import InputError, ModelFileError, few, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
 from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.profiles import PROBED_R2, Profile, probe
+from diffeo_calib.kernels.radial import PROBE, RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.provenance import Provenance, Summary
@@ -61,7 +62,9 @@ ROBOT_TENSORS = ("rigid_errors", "scales")
 """The same of a robot's model: joint errors of the geometric calibration alone, scales of kernels, priors and noise."""
 
 Tensors = dict[str, Tensor]
-KernelClasses = Mapping[str, type[Kernel]]
+KernelClasses = Mapping[str, type[Kernel] | type[Profile] | Profile]
+PROBE_TOLERANCE = 1e-9
+"""Largest relative difference between values of a profile passed to `load` and of that of the fit."""
 
 
 class MissingArgumentError(InputError):
@@ -159,10 +162,10 @@ def rebuild(
     Args:
         header, tensors: the output of :func:`describe`.
         nominal: the nominal map, for a model of a plain function.
-        kernels: kernel classes that are not part of the package, by class name.
+        kernels: kernel classes and profiles that are not part of the package, by name of the class or profile.
 
     Raises:
-        MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing.
+        MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing, or is another one than that of the fit.
         ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
@@ -295,13 +298,42 @@ def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
 
 def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
     if "kernel" not in term:
-        return RadialKernel.from_config(term)
+        return RadialKernel.from_config(term, lambda name: _own_profile(name, term.get(PROBE), classes))
     name = term["kernel"]
-    if name not in classes:
-        what = f"the model uses the kernel {name!r}, which is not part of diffeo_calib"
-        fix = f"pass its class: load(path, kernels={{{name!r}: ...}})"
-        raise MissingArgumentError.of(what, got=f"`kernels` with {few(list(classes)) or 'no class'}", fix=fix)
-    return classes[name].from_config(term["arguments"])
+    found = classes.get(name)
+    if not (isinstance(found, type) and issubclass(found, Kernel)):
+        raise _missing(f"kernel {name!r}", f"its class: load(path, kernels={{{name!r}: ...}})", classes)
+    return found.from_config(term["arguments"])
+
+
+def _missing(what: str, fix: str, classes: KernelClasses) -> MissingArgumentError:
+    got = f"`kernels` with {few(list(classes)) or 'no entry'}"
+    return MissingArgumentError.of(
+        f"the model uses the {what}, which is not part of diffeo_calib", got=got, fix=f"pass {fix}"
+    )
+
+
+def _own_profile(name: str, values: list[float] | None, classes: KernelClasses) -> Profile:
+    """The profile that a user passes, if it is that of the fit by its values; files of old versions have none."""
+    profile = classes.get(name)
+    if not isinstance(profile, Profile):
+        fix = f"it, with the parameters of the fit: load(path, kernels={{{name!r}: YourProfile(...)}})"
+        raise _missing(f"profile {name!r}", fix, classes)
+    if values is None:
+        warn_user(
+            f"the model file is of an old version: whether the profile {name!r} is that of its fit is not checked"
+        )
+        return profile
+    own = torch.tensor([probe(profile), values], dtype=torch.float64, device=HOST)
+    if not torch.allclose(own[0], own[1], rtol=PROBE_TOLERANCE, atol=0.0):
+        shown = [", ".join(f"{kappa:.6g}" for kappa in row) for row in own.tolist()]
+        raise MissingArgumentError.of(
+            f"the profile {name!r} passed in `kernels` is not that of the model",
+            expected=f"kappa = {shown[1]} at r2 = {', '.join(map(str, PROBED_R2))}",
+            got=shown[0],
+            fix="pass the profile of the fit, with the same parameters",
+        )
+    return profile
 
 
 PAYLOADS = ("payloads", "task_controls", "unladen_theta")

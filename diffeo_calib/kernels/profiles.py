@@ -250,3 +250,61 @@ PROFILES: dict[str, Profile] = {
 """All profiles by their names in model files."""
 SHIPPED = {type(profile) for profile in PROFILES.values()}
 """Their classes: unlike those of a user, they have no parameter that torch follows, and always compute the same."""
+PROBED_R2 = (0.0, 0.31, 1.7, 4.3)
+"""Squared distances at which a user's profile is checked, and compared with the one of a model file."""
+DIFFERENCE_STEP = 1e-4
+"""Step of finite differences, relative to r2."""
+DERIVATIVE_TOLERANCE = 1e-4
+"""Largest relative error of a derivative: beyond what finite differences leave, about 1e-7."""
+ROUNDING_TOLERANCE = 1e-8
+"""The same relative to the derivative before, where a derivative is so small that its differences are rounding."""
+
+
+def probe(profile: Profile) -> list[float]:
+    """kappa at :data:`PROBED_R2`."""
+    return [float(_at(profile, r2, 0)) for r2 in PROBED_R2]
+
+
+def check_profile(profile: Profile) -> None:
+    """Check a user's profile: its own name, kappa(0) = 1, derivatives that are those of kappa by finite differences.
+
+    Not for a parameter that a transform of torch.func follows, which has no numbers yet.
+
+    Raises:
+        InputError: it is not so, or one of the orders 0 to 3 is missing.
+    """
+    if type(profile) in SHIPPED or torch.compiler.is_compiling() or wrapped(torch.as_tensor(_at(profile, 0.0, 0))):
+        return
+    what = f"the profile {type(profile).__name__}"
+    if profile.name in PROFILES:
+        raise InputError.of(
+            what, got=f"`name` = {profile.name!r} of a profile of the package", fix="choose another name"
+        )
+    if abs(float(_at(profile, 0.0, 0)) - 1.0) > ROUNDING_TOLERANCE:
+        fix = "divide it by that, and pass `variance` to the kernel"
+        raise InputError.of(f"{what} at r2 = 0", expected="kappa = 1", got=float(_at(profile, 0.0, 0)), fix=fix)
+    for order in range(1, MAX_ORDER + 1):
+        for r2 in PROBED_R2[1:]:
+            step = DIFFERENCE_STEP * r2
+            below, above = (float(_at(profile, r2 + shift, order - 1)) for shift in (-step, step))
+            slope, given = (above - below) / (2.0 * step), float(_at(profile, r2, order))
+            allowed = DERIVATIVE_TOLERANCE * max(abs(slope), abs(given)) + ROUNDING_TOLERANCE * max(
+                abs(below), abs(above)
+            )
+            if not abs(slope - given) <= allowed:
+                raise InputError.of(
+                    f"{what}: `derivative` of order {order} at r2 = {r2:g}",
+                    expected=f"{slope:.6g}, the slope of order {order - 1} in r2 = |x - y|^2",
+                    got=f"{given:.6g}",
+                    fix=f"correct `derivative(r2, {order})` or `derivative(r2, {order - 1})`",
+                )
+
+
+def _at(profile: Profile, r2: float, order: int) -> Any:
+    """A derivative of a user's profile at one squared distance, detached."""
+    try:
+        value = profile.derivative(torch.tensor(r2, dtype=torch.float64, device=HOST), order)
+    except Exception as error:  # whatever a user's formula raises
+        what = f"the profile {type(profile).__name__} has no `derivative` of order {order} ({error!r})"
+        raise InputError.of(what, expected=f"orders 0 to {MAX_ORDER}") from error
+    return value.detach() if isinstance(value, Tensor) else value

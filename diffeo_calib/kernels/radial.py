@@ -8,7 +8,7 @@ Shapes: x (M, n) evaluation points; q, a (N, n) control points and their momenta
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,16 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, positive, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, check_points, diagonal_gram
-from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.profiles import (
+    PROFILES,
+    SHIPPED,
+    CauchyProfile,
+    GaussianProfile,
+    MaternProfile,
+    Profile,
+    check_profile,
+    probe,
+)
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 from diffeo_calib.kernels.reductions.formulas import (
@@ -31,6 +40,9 @@ from diffeo_calib.kernels.reductions.formulas import (
     Points,
 )
 from diffeo_calib.kernels.spaces import FeatureMap, Space
+
+PROBE = "profile_probe"
+"""Entry of a kernel whose profile is a user's: its values, see :func:`probe`."""
 
 
 class RadialKernel(DiagonalKernel):
@@ -44,6 +56,9 @@ class RadialKernel(DiagonalKernel):
         periodic: one flag for all coordinates, or one per coordinate (True: angle in rad).
         columns: the coordinates that the profile depends on; all of them by default.
         output: the only non-zero component of the field (A = variance e e^T), if given.
+
+    Raises:
+        InputError: numbers that are no scales, or a profile of your own whose derivatives are not those of its kappa.
     """
 
     def __init__(
@@ -56,6 +71,7 @@ class RadialKernel(DiagonalKernel):
         columns: Sequence[int] | None = None,
         output: int | None = None,
     ) -> None:
+        check_profile(profile)
         self.profile = profile
         self.lengthscale = positive(lengthscale, "lengthscale", scalar_or_vector(lengthscale))
         self.variance = _non_negative(variance)
@@ -121,8 +137,9 @@ class RadialKernel(DiagonalKernel):
         return moved
 
     def to_config(self) -> dict[str, Any]:
-        """The constructor's arguments as JSON values, the profile by its name."""
-        return {
+        """The constructor's arguments as JSON values, the profile by its name, and if it is a user's by some values."""
+        own = {} if type(self.profile) in SHIPPED else {PROBE: probe(self.profile)}
+        return own | {
             "profile": self.profile.name,
             "lengthscale": self.lengthscale.tolist(),
             "variance": self.variance.tolist(),
@@ -132,17 +149,23 @@ class RadialKernel(DiagonalKernel):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> RadialKernel:
+    def from_config(cls, config: Mapping[str, Any], own: Callable[[str], Profile] | None = None) -> RadialKernel:
         """The inverse of :meth:`to_config`.
+
+        Args:
+            config: its output.
+            own: a user's profile by its name, for one that is not part of the package.
 
         Raises:
             InputError: an unknown profile.
         """
         arguments = dict(config)
-        name = arguments.pop("profile")
-        if name not in PROFILES:
+        name, values = arguments.pop("profile"), arguments.pop(PROBE, None)
+        if values is None and name in PROFILES:
+            return cls(PROFILES[name], **arguments)
+        if own is None:
             raise InputError.of("the profile of a kernel", expected=", ".join(PROFILES), got=as_written(name))
-        return cls(PROFILES[name], **arguments)
+        return cls(own(name), **arguments)
 
     def _sum(self, formula: Formula, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
         return backends.evaluate(formula, self.profile, rows, columns, backend=self.backend, accuracy=self.accuracy)

@@ -113,6 +113,11 @@ class CalibratedKinematics:
         return self._with(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
 
     @property
+    def own_frame(self) -> bool:
+        """Whether no device measured positions, only readings or a ball in sockets: see :meth:`predict`."""
+        return self.map.workspace is not None and self.registration is None
+
+    @property
     def payload(self) -> float | None:
         """Mass that the robot carries in every query, in the unit of its measurements; None if they had no payload."""
         return self.nominal.load.mass
@@ -329,7 +334,7 @@ class CalibratedKinematics:
         return self.map.x
 
     def __call__(self, q: object) -> Tensor:
-        """Marker positions in the measuring frame.
+        """Marker positions in the measuring frame, or where none was measured in the model's own (:attr:`own_frame`).
 
         Args:
             q: (N, n) joint configurations, rad or m, in the order of ``robot.joint_names``.
@@ -394,6 +399,10 @@ class CalibratedKinematics:
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """Markers (N, P, 3) in m and their covariances (N, P, 3, 3) in m^2; see :meth:`FittedMap.predict`.
 
+        Positions are in the measuring frame. If no device measured one (:attr:`own_frame`), they are in the model's
+        own: then neither they nor the covariances, also without noise, say where that is in your world, and regions
+        hold true points only after one rigid motion of all. :meth:`registered` with positions finds it.
+
         Args:
             q: (N, n) joint configurations.
             noise: whether the covariance is that of a new measurement (default) or of the model alone.
@@ -411,6 +420,7 @@ class CalibratedKinematics:
         Returns:
             one entry for every device, and for markers that were mounted anew (their positions); none for a model of
             positions or poses alone, see :meth:`predict`.
+            Devices of a kind that is not registered in this session are left out, with a warning.
         """
         return predicted_readings(self, self._joints(q).detach(), noise=noise)
 

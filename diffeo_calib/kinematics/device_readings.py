@@ -119,6 +119,8 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
         model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
     """
     fitted: FittedMap = model.map
+    for own in model.placement:
+        own.warn_if_unknown()
     sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
     mounted = [one for own in model.placement if own.kind == MOUNTING for one in _mounted(model, own, q, noise=noise)]
     if not sets:

@@ -122,7 +122,7 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     """
     check_rows(kinematics, data)
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
-    unplaced = model is not None and model.map.workspace is not None and model.registration is None
+    unplaced = model is not None and model.own_frame
     points = partial(_predicted, kinematics)
     known = devices_of(kinematics), session_frames(kinematics), None if model is None else mounted_of(model)
     beside = Beside(points, *known, unplaced=unplaced, every_session=every_session)

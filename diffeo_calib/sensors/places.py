@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -206,6 +206,7 @@ SESSION, SOCKET, DRIFT = "session", "socket", "drift"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, markers
 that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m, frames on the tool, (D, 16)
 transforms from theirs to that of the model's tool, and columns with which something drifts, see `KnownDrift`."""
+WITHOUT_READINGS = SESSION, SOCKET, DRIFT, MOUNTING, MOUNTED_FRAME, CAMERA
 SET_UPS = SESSION, MOUNTING, MOUNTED_FRAME
 TRANSFORMS = SESSION, MOUNTED_FRAME
 """Kinds whose constants are transforms, the unit one for the model's own set-up."""
@@ -301,6 +302,9 @@ class PlacedDevices:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
         if self.kind == MOUNTING:
             return replace(self, constants=self.constants + markers.flatten()[: self.constants.shape[1]])
+        if self.unknown:
+            fix = "import the module that registers it"
+            raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
         if self.devices is None:
             return self
         each = [_carried(self.devices, number, before, after) for number in range(len(self.names))]
@@ -312,6 +316,18 @@ class PlacedDevices:
         if self.kind not in known_kinds():
             return None
         return known_kinds()[self.kind](self.names, self.constants, self.deviations.amax(0))
+
+    @property
+    def unknown(self) -> bool:
+        """Whether these are devices of a kind that nobody registered in this session."""
+        return self.kind not in (*WITHOUT_READINGS, *known_kinds())
+
+    def warn_if_unknown(self) -> None:
+        """Warn of devices that cannot be used, and say what to do."""
+        if self.unknown:
+            what = f"the model has {len(self.names)} devices of the kind {self.kind!r}, which is not registered here"
+            fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`), or install its package"
+            warn_user(sentence(f"{what}: their readings are not predicted", fix=fix))
 
     @property
     def cameras(self) -> dict[str, BoardCamera]:

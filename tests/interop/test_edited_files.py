@@ -39,7 +39,6 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "format in words": (("format",), "one", "format version 'one'"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
-    "unknown kernel": (("joint_kernel", 0, "profile"), "wavelet", "the profile of a kernel"),
     "kernel option": (("joint_kernel", 0, "surprise"), 1, "do not fit together"),
     "no kernel": (("task_kernel",), [], "do not fit together"),
     "kernel is a word": (("task_kernel",), "gaussian", "do not fit together"),

@@ -151,7 +151,8 @@ class Own(Profile):
     def derivative(self, r2: Any, order: int) -> Any:
         kappa, slope = (-(r2 * self.alpha)).exp() / (1.0 + r2) ** 2, -self.alpha - 2.0 / (r2 + 1.0)
         change = 2.0 * (1.0 + r2) ** -2
-        return (kappa, kappa * slope, kappa * (slope * slope + change))[order]
+        third = slope * (slope * slope + 3.0 * change) - 4.0 * (1.0 + r2) ** -3
+        return (kappa, kappa * slope, kappa * (slope * slope + change), kappa * third)[order]
 
 
 class Decorated(Own):

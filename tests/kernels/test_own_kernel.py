@@ -187,5 +187,5 @@ def test_a_matrix_that_is_no_kernel_is_refused(kernel: Kernel, words: str) -> No
 
 @pytest.mark.parametrize("classes", [["Skewed"], {"Skewed": Skewed(0.7, 0.4)}, {"Skewed": dict}, Skewed])
 def test_classes_of_kernels_are_checked(classes: object, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"`kernels`: expected names -> subclasses of dc\.Kernel"):
+    with pytest.raises(InputError, match=r"`kernels`: expected names -> subclasses of dc\.Kernel, or profiles"):
         dc.load(tmp_path / "none", kernels=classes)  # pyright: ignore[reportArgumentType]

@@ -15,6 +15,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.device_readings import PredictedReadings
+from diffeo_calib.sensors import kinds
 
 KINDS = ("distances", "heights", "images", "several kinds")
 
@@ -115,3 +116,29 @@ def test_a_payload_of_all_rows_is_a_number(command: Command, tmp_path: Any) -> N
     table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
     expected = 1e3 * kind.model.with_payload(4.0)(kind.q(2)).detach()[:, 0]
     np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], 1), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "own"), [("heights", True), ("positions", False)])
+def test_positions_without_a_device_are_said_to_be_in_the_models_own_frame(
+    name: str, own: bool, command: Command, tmp_path: Any
+) -> None:
+    kind = kind_named(name)
+    assert kind.model.own_frame is own
+    path = tmp_path / "q.csv"
+    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
+    done = command("predict", kind.file, path, *UNITS, "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.err
+    assert ("they are in the model's own frame" in " ".join(done.out.split())) is own
+
+
+def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, monkeypatch: Any) -> None:
+    kind = kind_named("heights")
+    dc.save(kind.model, tmp_path / "m.safetensors")
+    monkeypatch.delitem(kinds.KINDS, "height")
+    words = "devices of the kind 'height', which is not registered here: their readings.*import the module"
+    with pytest.warns(dc.DiffeoCalibWarning, match=words):
+        model: Any = dc.load(tmp_path / "m.safetensors")
+    with pytest.warns(dc.DiffeoCalibWarning, match=words):
+        assert model.predict_readings(kind.q(2)) == []
+    with pytest.raises(dc.DiffeoCalibError, match=r"kind 'height' in a model.*import the module"):
+        model.placement[0].carried(torch.eye(4), torch.zeros(0), torch.zeros(0), torch.zeros(0))

@@ -30,6 +30,10 @@ from diffeo_calib.measurements.table_format import TableFormat, flat_names
 Block = TypeVar("Block", bound=Sized)
 PERCENT = 100
 CHECKING = "checking, %"
+OWN_FRAME = (
+    "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
+    "rigid motion of all of them; `evaluate --register` with measured positions finds it"
+)
 
 
 def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> None:
@@ -83,6 +87,8 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    if kinematics.own_frame:
+        say(OWN_FRAME)
     for line in readings.sentences():
         say(line)
     if with_poses:

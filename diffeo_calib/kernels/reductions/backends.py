@@ -4,7 +4,7 @@ name         how it sums                                            memory     w
 dense        one matrix of all pairs                                O(M N)     few points
 fused        one loop compiled for the processor (extra `fused`)    O(M + N)   fastest on a CPU
 tiled        matrices on tiles that fit the cache, in plain torch   O(M + N)   works everywhere
-keops        LazyTensors, compiled by KeOps (extra `keops`)         O(M + N)   fastest on a GPU, for many points
+keops        LazyTensors, compiled by KeOps (needs a compiler)      O(M + N)   fastest on a GPU, for many points
 distributed  tiles shared by the processes of one torchrun program  O(M + N)   several processes
 auto         dense, fused, tiled or keops, by the number of pairs, the device and what is installed
 
