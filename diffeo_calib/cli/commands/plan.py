@@ -231,19 +231,18 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
     table = Table(title=title, title_justify="left", min_width=len(title))
     for column in (f"{more} poses".strip(), "model", *["held out"] * of_positions):
         table.add_column(column, justify="right")
-    for count in (*[0] * (not found.assumed and free is None), *found.counts):
+    fewest = 0 if free is None else int((found.expected_rms > OPEN_M).sum())
+    for count in (*[0] * (not found.assumed and not fewest), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
         table.add_row(str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions)
     out.print(table)
     if of_positions:
         say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
-    if free is not None:
-        fewest = int((found.expected_rms > OPEN_M).sum())
+    if fewest:
         say(f"fewer than {fewest} poses do not show where {free} now")
-        say(
-            "these errors are expected if nothing else has changed since the fit; `compare` tests that with the new rows"
-        )
+    if free is not None:
+        say("these errors are expected if nothing else has changed since the fit: test that by `compare`")
     if found.assumed:
         say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
 
