@@ -203,7 +203,7 @@ class Parameters(ChangedPart):
 
 @dataclass(frozen=True, eq=False)
 class Offset(ChangedPart):
-    """The offset of one joint, by which all its values differ from before: a new zero, a slipped gear.
+    """The offset of one joint, which all its readings lack since then: a new zero, a slipped gear.
 
     Args:
         joint: its column.
@@ -263,7 +263,8 @@ class Change:
     Args:
         part: name of the joint, "gravity" or "geometry".
         size: RMS of the change over the new rows: rad or m of a joint, m of the markers for other parts. Of an offset
-            the offset itself, with its sign.
+            what must be added to a reading of the joint beyond what was added at the old date: a joint that is at q by
+            its encoder is at q + size where the old model has it at q.
         angle: whether the size is in rad.
         displacement: RMS displacement of the markers by it, m.
         probability: that chance makes any likelihood ratio as large.
