@@ -18,7 +18,10 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
-pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
+    pytest.mark.slow,
+]
 
 Lines = dict[tuple[str, int], tuple[str, Tensor]]
 Law = Callable[[Kind, Any], Any]

@@ -362,7 +362,8 @@ def recalibrate_command(
 
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. The table is
     read as that of the old fit, unless options say otherwise. Says where device and markers are now and what has
-    changed in the robot, and writes a model that knows old rows and new ones.
+    changed in the robot, offsets with signs as `compare` states them, and writes a model that knows old rows and new
+    ones.
     """
     check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
@@ -398,7 +399,9 @@ def compare_command(
 
     With a table: a test for every joint, the load and the geometry. It is read as that of the old fit, unless options
     say otherwise. With a model: how far the two differ over the joint ranges that both know, beside what their
-    uncertainties explain.
+    uncertainties explain. An offset is added to what the joint reads: after a change by +0.5 mrad the joint stands
+    0.5 mrad farther in its positive direction than the old model has it at the same reading. The exit code is 0 whether
+    or not something has changed: with --json, programs read `changes` and `rows_can_tell`.
     """
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415

@@ -111,8 +111,8 @@ Marker = Annotated[
     MarkerFreedom,
     typer.Option(
         "--marker-freedom",
-        help="Whether the markers are the same (0.05 mm), have moved a little (1 mm) or are other ones; by default the "
-        "rows decide.",
+        help="Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) "
+        "or are other ones (anywhere); by default the rows decide.",
     ),
 ]
 Convention = Annotated[

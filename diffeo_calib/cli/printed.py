@@ -135,7 +135,7 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     found = model.registration
     if found is None:
         return
-    yield from motion_lines(found, model.on)
+    yield from motion_lines(found, model.on, doubt=": what else has changed is in them" * found.doubtful)
     rows = f"{found.rows} rows took part"
     yield (
         f"{rows}: RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted; "

@@ -273,7 +273,7 @@ def check_profile(profile: Profile) -> None:
     Raises:
         InputError: it is not so, or one of the orders 0 to 3 is missing.
     """
-    if type(profile) in SHIPPED or torch.compiler.is_compiling() or wrapped(torch.as_tensor(_at(profile, 0.0, 0))):
+    if type(profile) in SHIPPED or torch.compiler.is_compiling() or wrapped(_at(profile, 0.0, 0)):
         return
     what = f"the profile {type(profile).__name__}"
     if profile.name in PROFILES:
@@ -300,11 +300,11 @@ def check_profile(profile: Profile) -> None:
                 )
 
 
-def _at(profile: Profile, r2: float, order: int) -> Any:
+def _at(profile: Profile, r2: float, order: int) -> Tensor:
     """A derivative of a user's profile at one squared distance, detached."""
     try:
         value = profile.derivative(torch.tensor(r2, dtype=torch.float64, device=HOST), order)
     except Exception as error:  # whatever a user's formula raises
         what = f"the profile {type(profile).__name__} has no `derivative` of order {order} ({error!r})"
         raise InputError.of(what, expected=f"orders 0 to {MAX_ORDER}") from error
-    return value.detach() if isinstance(value, Tensor) else value
+    return torch.as_tensor(value, dtype=torch.float64, device=HOST).detach()

@@ -30,7 +30,7 @@ BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (
     "the spread within sockets is smaller than the true error: it contains neither errors that all rows of a socket "
-    "share nor the robot's size, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+    "share nor the robot's size, so that absolute errors are 2 to 6 times as large; do not compare models by it"
 )
 
 

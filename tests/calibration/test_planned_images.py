@@ -24,7 +24,10 @@ from diffeo_calib.measurements.poses import LEVER, poses_from_marks
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.board_camera import BoardCamera
 
-pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
+    pytest.mark.slow,
+]
 
 FEWEST = 4
 

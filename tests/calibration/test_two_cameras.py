@@ -36,7 +36,10 @@ from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import rotation
 
-pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
+    pytest.mark.slow,
+]
 
 SCALES = camera_on_tool().scales
 FIXED: Any = {"camera_on_tool": False, "board": BOARD_PRIOR}

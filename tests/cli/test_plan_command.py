@@ -61,6 +61,13 @@ def test_next_poses_and_poses_to_measure_again(
     assert done.code == 0, done.err
     expected = dc.plan(model, site.data.q, 6, free="base", measured=q, target=q)
     torch.testing.assert_close(planned(again, model.robot)[0], expected.q, rtol=0, atol=1e-8)
+    assert "do not show where" not in done.out
+    done = command("plan", file, "-n", 4, "-o", again, *UNITS, "--candidates", site.csv, "--free", "base")
+    rms = dc.plan(model, site.data.q, 4, free="base").expected_rms
+    assert rms[2] > 0.01 > rms[3]
+    assert "fewer than 3 poses do not show where the measuring device is now" in done.out
+    assert "if nothing else has changed since the fit" in done.out
+    assert f"{1e3 * float(rms[0]):.3f}" not in done.out  # its place, and no error of the robot
 
 
 @pytest.mark.parametrize(

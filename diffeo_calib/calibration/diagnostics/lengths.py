@@ -77,7 +77,7 @@ class Length(NamedTuple):
         least, motion = self.unnoticed
         return (
             f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm; "
-            f"less than {least / size:.2g} {unit} ({1e3 * motion * 3**0.5:.2g} mm) passes without a warning"
+            f"up to {least / size:.2g} {unit} ({1e3 * motion * 3**0.5:.2g} mm) may be wrong without a warning"
         )
 
 

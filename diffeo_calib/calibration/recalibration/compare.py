@@ -161,7 +161,9 @@ def compare(
         seed: of the samples.
 
     Returns:
-        a :class:`Comparison` with measurements, a :class:`ModelComparison` with a model.
+        a :class:`Comparison` with measurements, a :class:`ModelComparison` with a model. A change of a joint offset is
+        added to what the joint reads, by the new rows or the second model against the first: q + change is where the
+        joint is if the old model has it at q.
 
     Raises:
         InputError: arguments of another kind, models of different robots or without a common joint range.

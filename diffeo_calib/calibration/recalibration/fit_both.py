@@ -22,7 +22,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.placing.place import coordinates_of
-from diffeo_calib.calibration.recalibration.changes import ChangedPart, Drift, Transmission, parts_of
+from diffeo_calib.calibration.recalibration.changed_parts import ChangedPart, Transmission, parts_of
+from diffeo_calib.calibration.recalibration.changes import Drift
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton

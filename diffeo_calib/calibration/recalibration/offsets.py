@@ -40,7 +40,8 @@ class HiddenOffset(NamedTuple):
     """An offset that explains a new place as well.
 
     Args:
-        joint: its name. size, deviation: of the offset, rad or m. angle: whether it is in rad.
+        joint: its name. size, deviation: of the offset, rad or m, which is added to a reading as that of a
+            :class:`Change`. angle: whether it is in rad.
         instead: what has moved otherwise, in words.
     """
 

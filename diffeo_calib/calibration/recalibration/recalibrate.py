@@ -22,7 +22,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement, SettledAgain
-from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
+from diffeo_calib.calibration.recalibration.changed_parts import parts_of
+from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (

@@ -91,7 +91,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
     found.write(output, table, names)
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
-    _show(found, of_positions=all(one.of_positions for one in sensors))
+    _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
     for line in _lines_of_fit(source):
         say(line)
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
@@ -105,7 +105,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
 def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
     """Expected error over the joint ranges of the fit, and why that of the plan differs."""
     if isinstance(source, CalibratedKinematics):
-        yield "the table is of the poses drawn or given, perhaps beyond the fit's, and counts what its rows leave open"
+        yield "the table averages over the poses that were drawn or given; they may lie beyond those of the fit"
         yield from expectation_lines(source, None)
 
 
@@ -213,24 +213,36 @@ def _robot_and_base(given: Tree | CalibratedKinematics) -> tuple[Tree, Tensor]:
     return given, torch.eye(4, dtype=torch.float64, device=HOST)
 
 
-def _show(found: Plan, *, of_positions: bool) -> None:
+MOVED = {"base": "the measuring device is", "marker": "the markers are", "both": "device and markers are"}
+"""What --free names, in words."""
+OPEN_M = 0.01
+"""Expected error from which it is the place of what has moved."""
+
+
+def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
     """Print the expected errors by number of poses.
 
     Args:
         found: the plan. of_positions: whether held-out errors of the planned poses are errors of positions.
+        free: what has moved since the fit; without poses only its place would be expected to be wrong.
     """
     more = "" if found.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"
     table = Table(title=title, title_justify="left", min_width=len(title))
     for column in (f"{more} poses".strip(), "model", *["held out"] * of_positions):
         table.add_column(column, justify="right")
-    for count in (*[0] * (not found.assumed), *found.counts):
+    fewest = 0 if free is None else int((found.expected_rms > OPEN_M).sum())
+    for count in (*[0] * (not found.assumed and not fewest), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
         table.add_row(str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions)
     out.print(table)
     if of_positions:
         say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
+    if fewest:
+        say(f"fewer than {fewest} poses do not show where {free} now")
+    if free is not None:
+        say("these errors are expected if nothing else has changed since the fit: test that by `compare`")
     if found.assumed:
         say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
 

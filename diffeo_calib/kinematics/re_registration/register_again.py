@@ -54,8 +54,6 @@ MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
 LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
-LARGE_EXCESS = 3.0
-"""Residuals by this factor above the expected ones mean that something else has changed too."""
 ABSURD_EXCESS = 300.0
 """No change of a robot makes residuals so large: the rows are not what they are said to be."""
 NEGLIGIBLE_PROBABILITY = 0.01
@@ -373,7 +371,7 @@ def warn_about(found: Registration, *, outliers: bool = True, excess: bool = Tru
         warn_user(sentence(what, fix="measure these poses again"))
     for text in found.undetermined:
         warn_user(f"{text}.")
-    if found.excess > LARGE_EXCESS and excess:
+    if found.doubtful and excess:
         what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))

@@ -50,6 +50,9 @@ from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
 
+LARGE_EXCESS = 3.0
+"""Residuals by this factor above the expected ones mean that something else has changed too."""
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -99,6 +102,11 @@ class Registration:
     def rows(self) -> int:
         """Number of configurations that took part."""
         return len(self.q)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether errors remain that only a change of the robot or wrong rows explain: it is in the places, too."""
+        return self.excess > LARGE_EXCESS
 
     @property
     def frame_deviations(self) -> Tensor:
