@@ -326,7 +326,8 @@ def check_possible(model: CalibratedKinematics, places: Places, data: Any, found
                 "these errors are not those of a calibrated robot",
                 f"a median of {1e3 * float(away.median()):.4g}",
             )
-            fix = "check --length, the columns of --reading, and --session, which names the device of every row"
+            fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
+            fix += " (`device`, --session)"
             raise MeasurementError.of(what, got=f"{got} mm at the ball", fix=fix)
     seen = positions_of(model, places, data)
     if seen is not None and found.positions is not None and impossible(model, found.positions):
@@ -340,7 +341,8 @@ def some_rows(data: Measurements) -> Measurements:
 
 def causes_of(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
     """What moved, or that these are no errors of a calibrated robot."""
-    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in motions(model, some)]
+    fix = "register the model first: `model.registered`, evaluate --register"
+    causes = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
     return causes or [text for text in [implausible(model, some, errors)] if text is not None]
 
 
@@ -373,7 +375,7 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
                 got=f"{per_unit * median:.3g} {unit}",
                 fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
                 "device nor the markers have moved: a model predicts in the measuring frame of its fit (if they "
-                "have, register the model, evaluate --register, or recalibrate it)",
+                "have, register the model: `model.registered`, evaluate --register; or recalibrate it)",
             )
     return None
 

@@ -159,6 +159,13 @@ def test_other_marks_are_no_hidden_markers(read: Reader, cell: str) -> None:
         read(text(ROWS[0], f"0.3,0.4,1,2,3,{cell},{cell},{cell}"), position=TWO)
 
 
+@pytest.mark.parametrize(("cells", "column"), [(",inf,", "by"), (",,1e400", "bz"), (",nan,5", "by"), ("inf,,", "bx")])
+def test_wrong_cell_is_named_and_not_the_empty_one_beside_it(read: Reader, cells: str, column: str) -> None:
+    wrong = next(cell for cell in cells.split(",") if cell)
+    with pytest.raises(MeasurementError, match=says("line 5", f"'{column}'", f"'{wrong}'")):
+        read(text(*ROWS, f"0.7,0.8,1,2,3,{cells}"), position=TWO)
+
+
 def test_round_trip(tmp_path: Path) -> None:
     q, places = points(5000)  # several blocks
     std = np.where(np.isnan(places), nan, 0.001 + np.random.default_rng(1).random(places.shape))

@@ -316,8 +316,12 @@ class BadCells:
     lines: list[int] = field(default_factory=list)
 
     def add(self, line: int, name: str, text: str) -> None:
-        """Add a cell: its line, the name of its column, its text."""
-        self.first = self.first or (line, name, text)
+        """Add a cell: its line, the name of its column, its text.
+
+        Of the cells of one line, a wrong one is named rather than an empty one beside it.
+        """
+        if self.first is None or (self.first[0] == line and text and not self.first[2]):
+            self.first = (line, name, text)
         self.count += 1
         if line not in self.lines[-1:]:
             self.lines.append(line)
