@@ -38,7 +38,7 @@ def test_a_moved_device_is_named(fitted: Outcome, site: Site, command: Command, 
     (line,) = done.warnings
     found = re.fullmatch(
         r"warning: moving the measuring device by (\S+) mm and (\S+) degrees explains (\S+) % of the squared error; "
-        r"evaluate --register\.",
+        r"register the model first: `model.registered`, evaluate --register\.",
         line,
     )
     assert done.code == 0
