@@ -376,7 +376,7 @@ def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None)
         points = at.task[-1].points.view(len(q), -1, 3)
         added.append(PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
     if free in ("marker", "both"):
-        added.append(PLACES.found_m_rad * _by_marker(fitted, at, q))
+        added.append(PLACES.found_m_rad * _by_marker(fitted, at))
     more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
     return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
 
@@ -386,11 +386,11 @@ def _either(first: str | None, second: str) -> str:
     return second if first is None or first == second else "both"
 
 
-def _by_marker(fitted: FittedMap, at: Linearisation, q: Tensor) -> Tensor:
+def _by_marker(fitted: FittedMap, at: Linearisation) -> Tensor:
     """Derivatives of the markers by their places on the flange: (M, m, m)."""
     nominal = fitted.geodesic.spec.nominal
     if isinstance(nominal, FlangePoints):
-        return marker_slopes(fitted.geodesic, nominal, q)
+        return marker_slopes(fitted.geodesic, nominal, at)
     if not isinstance(nominal, GeometryMap):
         raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
     return at.sensitivity[..., nominal.geometry.slices["tool"]]
