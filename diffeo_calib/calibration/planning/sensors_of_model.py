@@ -26,26 +26,48 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     which keeps the slopes of its rows and the effects of its devices.
     """
     fitted, q, known = model.map, model.configurations, _known_devices(model)
-    shared, visible = fitted.noise.shared, fitted.noise.visible
-    moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
-    read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
-    for rows, _ in known:
-        read[rows] = True
-    cameras, imaged = [own for own in model.placement if own.cameras], torch.zeros_like(read)
-    for own in cameras:
-        imaged[own.rows] = True
-    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & ~imaged & of_ball
-    device = Positions(whole=model.lever is not None)
-    found: list[Sensor] = [device] if bool((~read & ~resting & ~imaged).any()) else []
-    found += [camera for own in cameras for camera in board_images(model, own)]
+    shared = fitted.noise.shared
+    measured, read, resting = _rows_by_sensor(model)
+    found: list[Sensor] = [Positions(whole=model.lever is not None)] if bool(measured.any()) else []
+    found += [camera for own in model.placement for camera in board_images(model, own)]
     if bool(resting.any()):
         found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
+    moved = (shared != 0).any(1)  # (N, c) unknowns of a row
     if known:
-        return (*found, *(DeviceReadings(None, devices, moved[rows].any(0)) for rows, devices in known))
+        own = ((devices, moved[rows].any(0), _noise(model, rows)) for rows, devices in known)
+        return (*found, *(DeviceReadings(None, *parts) for parts in own))
     for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
         found.append(_device(model, (rows, own), _name(model, rows)))
     return tuple(found)
+
+
+def without_positions(model: CalibratedKinematics) -> bool:
+    """Whether no device of positions or poses measured rows of a model."""
+    return not bool(_rows_by_sensor(model)[0].any())
+
+
+def _rows_by_sensor(model: CalibratedKinematics) -> tuple[Tensor, Tensor, Tensor]:
+    """(N,) boolean: rows of the fit that tell positions or poses, readings, and a ball in sockets, but for images."""
+    fitted = model.map
+    shared, visible = fitted.noise.shared, fitted.noise.visible
+    of_ball = torch.full_like(visible[:, 0], model.ball)
+    read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
+    imaged = torch.zeros_like(read)
+    for own in model.placement:
+        if own.devices is not None:
+            read[own.rows] = True
+        if own.cameras:
+            imaged[own.rows] = True
+    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & ~imaged & of_ball
+    return ~read & ~resting & ~imaged, read, resting
+
+
+def _noise(model: CalibratedKinematics, rows: Tensor) -> Tensor:
+    """(r, r) noise of the readings of a device by its rows (M,) of the fit, m^2."""
+    noise = model.map.noise
+    numbers = noise.visible[rows][0]
+    return noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
 
 
 def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
@@ -105,6 +127,6 @@ def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) 
         devices = kind((name,), constants[None], deviations)
         again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
-            return DeviceReadings(None, devices, columns)
+            return DeviceReadings(None, devices, columns, _noise(model, rows))
     fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
     raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)
