@@ -294,10 +294,13 @@ class CampaignModel:
         Args:
             joints: (N, n) in place of theirs.
         """
+        others = table.rows(list(numbers))
+        return self._around(others if joints is None else with_joints(others, joints))
+
+    def _around(self, others: Any) -> Around:
         known = self.placed.data
         anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
-        others = table.rows(list(numbers))
-        whole = joined_tables([anchors, others if joints is None else with_joints(others, joints)])
+        whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
         return Around(data.rows(index), lambda: placed.placement.changes(seen_rows(data)), index)
@@ -306,7 +309,8 @@ class CampaignModel:
         """The target, and the candidates as if they were measured like the last row."""
         candidates = self.asked[0]
         last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
-        return self.target(self.scales), Rows.of(self.around(table, last, candidates).data, self.scales)
+        like = self.placed.measured_at(with_joints(table.rows(last), candidates), candidates)
+        return self.target(self.scales), Rows.of(self._around(like).data, self.scales)
 
     def target(self, scales: Hyperparameters) -> Rows:
         """The places at which the robot shall be accurate."""
