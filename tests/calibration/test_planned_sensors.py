@@ -176,6 +176,35 @@ def test_devices_of_a_fit_have_the_noise_of_their_rows(name: str) -> None:
         assert 0.8 < float(planned / known) < 1.25
 
 
+AGAIN = ("heights", "distances", "images", "mixture", "several kinds", "two cameras", "two cameras on the tool")
+
+
+@pytest.mark.parametrize("name", marked(*AGAIN))
+def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) -> None:
+    """The devices under their names; no place on the tool is open that no row of the registration could tell."""
+    kind = kind_named(name)
+    names = {f"socket {k}" for k in range(1, 9)} | {"positions"}
+    names |= {word for own in kind.model.placement for each in own.names for word in (each, f"{own.kind} {each}")}
+    before = float(dc.plan(kind.model, kind.q(30), 1).expected_rms[0])
+    for model in (dc.recalibrate(kind.model, kind.new).model, kind.model.registered(kind.new)):
+        found = dc.plan(model, kind.q(30), 3)
+        assert set(found.devices) <= names
+        assert float(found.expected_rms[3]) <= float(found.expected_rms[0]) < 2.5 * before
+
+
+@pytest.mark.parametrize("name", marked("heights", "distances", "images"))
+def test_devices_of_new_rows_are_found_again(name: str) -> None:
+    """What the new rows of a recalibration left open of a device is what a planned reading of it shares with them."""
+    kind = kind_named(name)
+    model = dc.recalibrate(kind.model, kind.new).model
+    first, shared = len(kind.data), model.map.noise.shared
+    for sensor in sensor_of(model):
+        assert isinstance(sensor, DeviceReadings)
+        assert sensor.columns is not None
+        mine = [k for k, own in enumerate(kind.new.device_names) if own == sensor.devices.names[0]]
+        assert torch.equal(sensor.columns, (shared[[first + k for k in mine]] != 0).any(1).any(0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["images of a board", "two cameras"])
 @pytest.mark.parametrize("sensor", [dc.Sensor.positions(), dc.Sensor.poses()])

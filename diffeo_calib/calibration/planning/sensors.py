@@ -270,11 +270,13 @@ class DeviceReadings(Sensor):
         columns: (c0,) boolean, the shifts of the fit that are theirs; None for new devices. The devices of a fit are in
             the frame of the model's positions.
         noise: (r, r) of a reading by rows of the fit, m^2; None where there are none.
+        around: whether these new devices are in that frame too: they were placed around the model since.
     """
 
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
     columns: Tensor | None = None
     noise: Tensor | None = None
+    around: bool = False
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -295,7 +297,8 @@ class DeviceReadings(Sensor):
 
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the tool."""
-        base = scene.base if self.columns is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
+        in_base = self.columns is None and not self.around
+        base = scene.base if in_base else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
         last = scene.seen_by(self.devices)
         points = (scene.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]
         points, turn = (points @ base[:3, :3]).flatten(1), torch.block_diag(*[base[:3, :3].mT] * points.shape[1])
