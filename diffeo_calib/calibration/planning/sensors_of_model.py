@@ -12,7 +12,6 @@ from diffeo_calib.calibration.planning.sensors import DeviceReadings, InSockets,
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.places import PlacedDevices
@@ -59,7 +58,8 @@ def _rows_by_sensor(model: CalibratedKinematics) -> tuple[Tensor, Tensor, Tensor
     shared, visible = fitted.noise.shared, fitted.noise.visible
     of_ball, count = torch.full_like(visible[:, 0], model.ball), visible.sum(1)
     read = (count <= MOST_NUMBERS) & of_ball if fitted.slopes is not None else torch.zeros_like(of_ball)
-    read |= count % (3 if model.lever is None else 3 * POINTS) != 0
+    body = 3 * fitted.m // len(model.bodies.averaging(fitted.new_noise))  # numbers of a marker, or of a pose
+    read |= count % body != 0
     imaged = torch.zeros_like(read)
     for own in model.placement:
         if own.devices is not None:
