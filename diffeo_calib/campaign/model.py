@@ -25,7 +25,7 @@ from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.bodies import bodies_of
@@ -312,6 +312,11 @@ class CampaignModel:
 
     def _around(self, others: Any) -> Around:
         known = self.placed.data
+        unknown = set(others.device_names) - set(known.device_names)
+        if unknown:
+            fix = "they are judged once a model holds some of them"
+            expected, got = few(sorted(set(known.device_names))), few(sorted(unknown))
+            raise MeasurementError.of("the set-ups and devices of rows", expected=expected, got=got, fix=fix)
         anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)

@@ -50,6 +50,7 @@ class ImageTable(RowTable):
     points: Tensor
     board: Tensor | None
     lever: Any
+    session: Tensor | None
     session_names: tuple[str, ...]
     corners: Tensor | None
     cameras: Mapping[str, Camera]
@@ -110,6 +111,17 @@ class ImageTable(RowTable):
     def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Self:
         """See :meth:`Measurements.with_sessions`."""
         raise NotImplementedError
+
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """The same tables, their set-ups numbered alike."""
+        names = tuple(dict.fromkeys(name for table in tables for name in table.session_names))
+        found = []
+        for table in super().of_one_layout(tables):
+            own = torch.tensor([names.index(name) for name in table.session_names] + [-1], device=HOST)
+            session = None if table.session is None else own[table.session]
+            found.append(table if session is None else with_attributes(table, session=session, session_names=names))
+        return found
 
     @property
     def camera(self) -> Camera | None:

@@ -273,6 +273,18 @@ def test_rows_before_a_model_say_what_is_missing() -> None:
     assert all(one.cause == "" for one in campaign.verdicts)
 
 
+def test_set_ups_come_one_after_the_other(measured: tuple[Tensor, Tensor]) -> None:
+    """As a table that grows has them: the rows of each set-up name it alone."""
+    q, y = (part[:30] for part in measured)
+    first, second = (dc.Measurements(q[some], y[some]) for some in (slice(0, 20), slice(20, 30)))
+    second = dc.Measurements(second.q, second.points + 0.5)  # seen from elsewhere
+    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
+    campaign.add(first.with_sessions(["monday"] * 20))
+    campaign.add(second.with_sessions(["tuesday"] * 10))
+    assert campaign.accepted == list(range(30))
+    assert campaign.table.device_names == ["monday"] * 20 + ["tuesday"] * 10
+
+
 def test_the_limit_holds_95_percent_of_errors() -> None:
     random = torch.Generator("cpu").manual_seed(0)
     root = torch.randn(60, 20, generator=random, dtype=torch.float64)
