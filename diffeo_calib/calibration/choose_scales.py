@@ -257,10 +257,14 @@ def _with_gear_lines(
     return replace(again, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
 
 
+def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
+    """Squared leave-one-out errors relative to what the scales predict: medians, since outliers are reported apart."""
+    return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
+
+
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
-    # Medians, since outliers are reported by themselves.
-    ratio = float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
+    ratio = variance_ratio(data, left_out)
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
     overstated = data.noise_model.known is not None and ratio < 1 / LIMITS.variance_ratio
     if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):

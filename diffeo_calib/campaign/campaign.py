@@ -93,6 +93,7 @@ class Campaign:
         self._made: list[CampaignModel] = []
         self._maker: Thread | None = None
         self._tried = 0
+        self._obstacle = ""  # why there is no first model
 
     def __len__(self) -> int:
         return len(self.verdicts)
@@ -215,6 +216,8 @@ class Campaign:
             self._judge(self._model, self.table)
         self._renew()
         self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
+        if self._model is None:
+            self.verdicts[row] = replace(self.verdicts[row], cause=self._obstacle)
         for one in self.verdicts[:row]:
             if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
                 self.verdicts[one.row] = replace(one, again=False)
@@ -266,7 +269,10 @@ class Campaign:
         try:
             choice, certain = (scales, first, self.seed), self.goal is not None
             made = CampaignModel.of(self.robot, table, verdicts, asked, choice, certain=certain)
-        except DiffeoCalibError:
+            if old is None:
+                made.check_placed()
+        except DiffeoCalibError as error:
+            self._obstacle = str(error)
             return
         if self._draws:
             made = made.with_open_candidates(CANDIDATES, self.seed, table, verdicts)
@@ -286,6 +292,8 @@ class Campaign:
         if self._maker is not None and not self._maker.is_alive():
             self._maker = None
         if self._made:
+            if self._model is None:
+                self.verdicts = [replace(one, cause="") if one.fits is None else one for one in self.verdicts]
             self._model = self._caught_up(self._made.pop())
             self._renew()
             return True

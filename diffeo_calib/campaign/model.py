@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few
+from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
+from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales, noise_of_few, variance_ratio
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
@@ -24,12 +25,13 @@ from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -115,6 +117,8 @@ class CampaignModel:
             if known is not None:
                 known = replace(known, lines=())
             chosen = choose_scales(data, rows, *stages, given=known, seed=seed)
+        if first:
+            _check_first(chosen)
         found, data = chosen.selection.scales, chosen.data
         later: Any = None
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
@@ -146,6 +150,15 @@ class CampaignModel:
         own = {"posterior": posterior, "window": window, "last": last, "taken": taken, "ratios": list(self.ratios)}
         own |= {"compared": _compared(self.placed, asked[0]), "open": self.placed.sees(self.asked[0])}
         return replace(self, **own, seen=len(table))
+
+    def check_placed(self) -> None:
+        """MeasurementError while rows do not say where the robot stands: around a wrong place nothing can be judged."""
+        if self.expected_error > PLACES.found_m_rad:
+            got, fix = f"{1e3 * self.expected_error:.3g} mm", "measure more rows, of other poses and of every device"
+            expected = f"an expected error below {1e3 * PLACES.found_m_rad:g} mm"
+            raise MeasurementError.of(
+                "the first rows do not show the places of the devices yet", expected=expected, got=got, fix=fix
+            )
 
     def with_open_candidates(self, count: int, seed: int, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
         """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
@@ -294,10 +307,18 @@ class CampaignModel:
         Args:
             joints: (N, n) in place of theirs.
         """
-        known = self.placed.data
-        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
         others = table.rows(list(numbers))
-        whole = joined_tables([anchors, others if joints is None else with_joints(others, joints)])
+        return self._around(others if joints is None else with_joints(others, joints))
+
+    def _around(self, others: Any) -> Around:
+        known = self.placed.data
+        unknown = set(others.device_names) - set(known.device_names)
+        if unknown:
+            fix = "they are judged once a model holds some of them"
+            expected, got = few(sorted(set(known.device_names))), few(sorted(unknown))
+            raise MeasurementError.of("the set-ups and devices of rows", expected=expected, got=got, fix=fix)
+        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
+        whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
         return Around(data.rows(index), lambda: placed.placement.changes(seen_rows(data)), index)
@@ -306,7 +327,8 @@ class CampaignModel:
         """The target, and the candidates as if they were measured like the last row."""
         candidates = self.asked[0]
         last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
-        return self.target(self.scales), Rows.of(self.around(table, last, candidates).data, self.scales)
+        like = self.placed.measured_at(with_joints(table.rows(last), candidates), candidates)
+        return self.target(self.scales), Rows.of(self._around(like).data, self.scales)
 
     def target(self, scales: Hyperparameters) -> Rows:
         """The places at which the robot shall be accurate."""
@@ -316,6 +338,15 @@ class CampaignModel:
         c = 0 if self.data.shared is None else self.data.shared.shape[2]
         nothing, seen = q.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
         return Rows(at, q.new_zeros(count, m, c), q.new_zeros(count, m, m), nothing, seen)
+
+
+def _check_first(chosen: ChosenScales) -> None:
+    """MeasurementError for few rows that contradict each other: around wrong places all later rows would be wrong."""
+    ratio = variance_ratio(chosen.data, chosen.left_out)
+    if ratio > SCALE_LIMITS.variance_ratio:
+        expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
+        fix = "measure more rows, then the model is made"
+        raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
 
 
 def with_joints(table: Any, q: Tensor) -> Any:

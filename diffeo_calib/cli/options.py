@@ -471,7 +471,8 @@ class Planned:
         "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
         "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane of this normal at this "
         "distance from the base, "
-        "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
+        "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more. "
+        "Noise is as that of the rows of MODEL.",
         "KIND[=NUMBERS]",
     )
     payload_mass: Mass = None

@@ -25,6 +25,7 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
@@ -191,7 +192,7 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     points, at = kinematics.deformation.linearised_value(rows)
     covariance = fitted.covariance_between(at)  # directions that the data leave open are those of both motions
     points = points.unflatten(1, (3, 3))
-    motions = _motions(kinematics, rows, points).flatten(0, 1)  # (9 (R + M), 12)
+    motions = _motions(kinematics, at, points).flatten(0, 1)  # (9 (R + M), 12)
     reference, own = motions.split([9 * len(every), 9 * len(q)])
     eye = torch.eye(len(own), dtype=own.dtype, device=own.device)
     rest = torch.cat([-own @ torch.linalg.pinv(reference, rtol=SMALLEST_MOTION), eye], 1)
@@ -200,10 +201,10 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     return rest @ covariance @ rest.mT
 
 
-def _motions(kinematics: ToolKinematics, q: Tensor, points: Tensor) -> Tensor:
+def _motions(kinematics: ToolKinematics, at: Linearisation, points: Tensor) -> Tensor:
     """Derivatives of points (N, 3, 3) by a motion of the base and one of the tool on its flange: (N, 9, 12)."""
     base = frame_slopes(points, points.mean((0, 1)))
     own = tool_points(kinematics.tool).to(points)
     flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)
-    by_place = marker_slopes(kinematics.deformation, flange, q)
+    by_place = marker_slopes(kinematics.deformation, flange, at)
     return torch.cat([base, by_place @ frame_slopes(own[None], own.mean(0))[0]], 2)

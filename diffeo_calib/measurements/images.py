@@ -50,6 +50,7 @@ class ImageTable(RowTable):
     points: Tensor
     board: Tensor | None
     lever: Any
+    session: Tensor | None
     session_names: tuple[str, ...]
     corners: Tensor | None
     cameras: Mapping[str, Camera]
@@ -111,6 +112,17 @@ class ImageTable(RowTable):
         """See :meth:`Measurements.with_sessions`."""
         raise NotImplementedError
 
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """The same tables, their set-ups numbered alike."""
+        names = tuple(dict.fromkeys(name for table in tables for name in table.session_names))
+        found = []
+        for table in super().of_one_layout(tables):
+            own = torch.tensor([names.index(name) for name in table.session_names] + [-1], device=HOST)
+            session = None if table.session is None else own[table.session]
+            found.append(table if session is None else with_attributes(table, session=session, session_names=names))
+        return found
+
     @property
     def camera(self) -> Camera | None:
         """The only camera; None without images, or of several."""
@@ -169,6 +181,18 @@ class ImageTable(RowTable):
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
         found = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
         return dict(zip(OF_POSES, found, strict=True))
+
+    def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
+        """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
+
+        Args:
+            q: rad or m. poses: of the board in the camera. errors: as of :func:`~diffeo_calib.cameras.seeing.expected`,
+                those of lens and board as effects (N, 6, c) of unit variance.
+        """
+        on_tool = self.board is not None
+        seen = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
+        own = {name: getattr(seen, name) for name in ("q", "poses", "points", "board")}
+        return with_attributes(self, **own, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
 
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.
@@ -254,11 +278,16 @@ def image_columns(
     poses, covariance, shared = (
         torch.cat([getattr(own, name) for own in found])[order] for name in ("poses", "covariance", "shared")
     )
-    sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see pose_frames.py
-    larger = torch.cat([poses[:, :3, 3], torch.zeros_like(poses[:, :3, 3])], 1)[..., None]
-    errors = dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
+    errors = errors_of_poses(poses, covariance, shared, camera_on_tool=camera_on_tool)
     after = dict(zip(known, (own.camera for own in found), strict=True))
     return {"poses": poses, "corners": given, "cameras": after, "seen_by": seen_by} | errors
+
+
+def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera_on_tool: bool) -> dict[str, Tensor]:
+    """The columns ``OF_POSES`` of boards at poses (N, 4, 4), m, in the cameras: see :class:`ImageTable`."""
+    sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see pose_frames.py
+    larger = torch.cat([poses[:, :3, 3], torch.zeros_like(poses[:, :3, 3])], 1)[..., None]
+    return dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
 
 
 def _check_size(images: Images, whose: str) -> None:

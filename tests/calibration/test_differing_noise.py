@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kind_bank import kind_named
 from scipy.stats import chi2
 from simulated_camera import camera_arm
 from tangent_bank import Setting, normal, two_markers
@@ -99,6 +100,18 @@ def test_new_noise_is_the_mean_and_what_differs() -> None:
     factor = differing_factor(each, mean, data.visible)
     assert factor > 1.001
     torch.testing.assert_close(robot_problem(data, scales).new_noise, factor * mean, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+@pytest.mark.parametrize("name", ["several kinds", "laser beams", "inclinations"])
+def test_coordinates_beside_readings_have_the_tails_of_all_rows(name: str) -> None:
+    """Those of the geometric calibration, which it leaves large, would widen the noise of a position by a half."""
+    noise, new = kind_named(name).model.map.noise, kind_named(name).model.map.new_noise
+    whole = noise.visible.sum(1) == noise.visible.sum(1).max()
+    size = int(noise.visible[whole][0].sum())
+    measured = noise.covariance[whole][:, :size, :size].diagonal(dim1=1, dim2=2).mean()
+    assert 0.9 < float(new[:size, :size].diagonal().mean() / measured) < 1.15
 
 
 def test_rows_with_known_deviations_keep_their_own() -> None:

@@ -14,11 +14,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.planning.board_images import BoardImages
 from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cameras.images import Images, sighted
 from diffeo_calib.cameras.seeing import expected, sees, shown
+from diffeo_calib.campaign.model import with_joints
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import LEVER, poses_from_marks
 from diffeo_calib.robots.se3 import rotation
@@ -195,6 +198,22 @@ def test_a_campaign_proposes_what_its_camera_sees() -> None:
     proposed = given.next(5)
     assert proposed is not None
     assert sorted(proposed.rows) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["images of a board", "two cameras", "two cameras on the tool"])
+def test_an_image_like_the_last_one_elsewhere_is_the_one_there(name: str) -> None:
+    """Not the last one again, whose view is another: its lens would err by the same everywhere."""
+    data = kind_named(name).data
+    placed = place(kind_named(name).robot, data, silent)
+    mine = torch.tensor([own == data.camera_names[-1] for own in data.camera_names]).nonzero()[:, 0]
+    rows = mine[placed.sees(data.q[mine])]
+    assert len(rows) > 0.8 * len(mine)
+    last = data.rows(torch.full_like(rows, len(data) - 1))
+    found, own = placed.measured_at(with_joints(last, data.q[rows]), data.q[rows]), data.rows(rows)
+    for column, most in (("points", 0.01), ("pose_shared", 0.01), ("pose_larger", 0.01), ("pose_covariance", 0.3)):
+        value, known = getattr(found, column), getattr(own, column)
+        assert float((value - known).norm() / known.norm()) < most, column
+        assert float((getattr(last, column) - known).norm() / known.norm()) > most
 
 
 def test_a_campaign_asks_the_camera_of_a_row() -> None:

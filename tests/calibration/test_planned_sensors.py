@@ -10,10 +10,12 @@ import pytest
 import reading_bank
 import torch
 import two_arms_bank
-from kind_bank import kind_named, rigid_rms
+from kind_bank import kind_named, marked, rigid_rms
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning.knowledge import of_model
+from diffeo_calib.calibration.planning.sensors import DeviceReadings
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
@@ -74,7 +76,7 @@ def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[floa
         A, D = slopes_of(devices, number, z[row])
         H = torch.zeros(len(A), len(K), dtype=q.dtype)
         H[:, 3 * row : 3 * row + 3], H[:, len(B) :] = A, D
-        R = A @ fitted_map.new_noise @ A.T
+        R = fitted_map.noise.covariance[0]  # all rows are measured alike
         K = K - K @ H.T @ torch.linalg.solve(H @ K @ H.T + R, H @ K)
         found.append(rms())
     return found
@@ -155,6 +157,68 @@ def test_expected_errors_of_distances_come_true() -> None:
     again = dc.calibrate(arm.nominal, both, hyperparameters=reading_bank.scales()).model
     for model, expected in ((result.model, plan.expected_rms[0]), (again, plan.expected_rms[-1])):
         assert 0.4 < rigid_rms(model(q).detach(), arm.true_points(q)) / float(expected) < 1.6
+
+
+@pytest.mark.parametrize("name", marked("heights", "images and a tracker", "several kinds", "inclinations"))
+def test_devices_of_a_fit_have_the_noise_of_their_rows(name: str) -> None:
+    """Not that of rows of another kind: of images of a board, in which its origin is uncertain by a millimetre."""
+    model = kind_named(name).model
+    noise, start = model.map.noise, of_model(model, model.configurations, None)
+    sensors: Any = {own.devices.names: own for own in sensor_of(model) if isinstance(own, DeviceReadings)}
+    placed = [(own, k, word) for own in model.placement if own.devices is not None for k, word in enumerate(own.names)]
+    assert len(sensors) == len(placed)
+    for own, number, word in placed:
+        rows = own.rows[own.device == number]
+        (sensor,) = (one for (key,), one in sensors.items() if key in (word, f"{own.kind} {word}"))
+        seen = noise.visible[rows[0]]
+        known = noise.covariance[rows][:, seen][:, :, seen].diagonal(dim1=1, dim2=2).mean().sqrt()
+        planned = sensor.options(start.scene).noise.diagonal(dim1=1, dim2=2).mean().sqrt()
+        assert 0.8 < float(planned / known) < 1.25
+
+
+AGAIN = ("heights", "distances", "images", "mixture", "several kinds", "two cameras", "two cameras on the tool")
+
+
+@pytest.mark.parametrize("name", marked(*AGAIN))
+def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) -> None:
+    """The devices under their names; no place on the tool is open that no row of the registration could tell."""
+    kind = kind_named(name)
+    names = {f"socket {k}" for k in range(1, 9)} | {"positions"}
+    names |= {word for own in kind.model.placement for each in own.names for word in (each, f"{own.kind} {each}")}
+    before = float(dc.plan(kind.model, kind.q(30), 1).expected_rms[0])
+    for model in (dc.recalibrate(kind.model, kind.new).model, kind.model.registered(kind.new)):
+        found = dc.plan(model, kind.q(30), 3)
+        assert set(found.devices) <= names
+        assert float(found.expected_rms[3]) <= float(found.expected_rms[0]) < 2.5 * before
+
+
+@pytest.mark.parametrize("name", marked("heights", "distances", "images"))
+def test_devices_of_new_rows_are_found_again(name: str) -> None:
+    """What the new rows of a recalibration left open of a device is what a planned reading of it shares with them."""
+    kind = kind_named(name)
+    model = dc.recalibrate(kind.model, kind.new).model
+    first, shared = len(kind.data), model.map.noise.shared
+    for sensor in sensor_of(model):
+        assert isinstance(sensor, DeviceReadings)
+        assert sensor.columns is not None
+        mine = [k for k, own in enumerate(kind.new.device_names) if own == sensor.devices.names[0]]
+        assert torch.equal(sensor.columns, (shared[[first + k for k in mine]] != 0).any(1).any(0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["images of a board", "two cameras"])
+@pytest.mark.parametrize("sensor", [dc.Sensor.positions(), dc.Sensor.poses()])
+def test_a_tracker_beside_cameras_stands_anywhere(name: str, sensor: Any) -> None:
+    """No row of the fit was measured by it: its first says where it is."""
+    kind = kind_named(name)
+    rms = dc.plan(kind.model, kind.q(30), 12, sensor=sensor).expected_rms
+    assert float(rms[1]) > 0.999 * float(rms[0])
+    assert float(rms[12]) < 0.95 * float(rms[0])
+
+
+def test_noise_of_a_stated_deviation(arm: Any) -> None:
+    found = dc.plan(arm.model, arm.train.q, 2, sensor=dc.Sensor.positions(1e-4))
+    assert found.noise_rms == pytest.approx(3**0.5 * 1e-4)
 
 
 def test_poses_of_a_ball_in_sockets() -> None:

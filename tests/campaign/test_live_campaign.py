@@ -240,7 +240,7 @@ def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sessions", "mixture", "several kinds", "payloads"])
+@pytest.mark.parametrize("name", ["sessions", "mixture", "several kinds", "payloads", "inclinations", "laser beams"])
 def test_other_kinds_of_rows(name: str) -> None:
     """The rows of the bank in random order, enough to place every device and for two models."""
     kind = kind_named(name)
@@ -258,6 +258,31 @@ def test_other_kinds_of_rows(name: str) -> None:
     found = campaign.next(2)
     assert found is not None
     assert found.expected[2] < found.expected[0]
+
+
+def test_rows_before_a_model_say_what_is_missing() -> None:
+    """Devices of readings are placed by 40 rows; then nothing is missing any more."""
+    kind = kind_named("heights")
+    campaign = dc.Campaign(kind.robot, candidates=kind.q(20), target=kind.q(10))
+    assert all(one.cause == "" for one in campaign.add(kind.data.rows(slice(0, 11))))
+    (last,) = campaign.add(kind.data.rows([11]))
+    assert last.fits is None
+    assert "at least 40 rows" in str(last)
+    campaign.add(kind.data.rows(slice(12, 41)))
+    assert campaign.models == 1
+    assert all(one.cause == "" for one in campaign.verdicts)
+
+
+def test_set_ups_come_one_after_the_other(measured: tuple[Tensor, Tensor]) -> None:
+    """As a table that grows has them: the rows of each set-up name it alone."""
+    q, y = (part[:30] for part in measured)
+    first, second = (dc.Measurements(q[some], y[some]) for some in (slice(0, 20), slice(20, 30)))
+    second = dc.Measurements(second.q, second.points + 0.5)  # seen from elsewhere
+    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
+    campaign.add(first.with_sessions(["monday"] * 20))
+    campaign.add(second.with_sessions(["tuesday"] * 10))
+    assert campaign.accepted == list(range(30))
+    assert campaign.table.device_names == ["monday"] * 20 + ["tuesday"] * 10
 
 
 def test_the_limit_holds_95_percent_of_errors() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,7 +13,8 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
-from diffeo_calib.cameras.seeing import sees
+from diffeo_calib.cameras.images import Camera
+from diffeo_calib.cameras.seeing import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.pose_frames import inverse_poses
@@ -22,6 +23,8 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
 from diffeo_calib.sensors.mounted import View
 from diffeo_calib.sensors.places import PlacedDevices
+
+T = TypeVar("T")
 
 SIZE_WARNED, SIZE_REFUSED = 0.006, 0.02
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
@@ -165,14 +168,33 @@ class LensAndBoard(CameraErrors):
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         """See :class:`DeviceSet`: whether the camera of the row sees its board."""
+        seen = self._boards(row, points, views)
+        return super().sees(row, points, views) if seen is None else sees(*seen)
+
+    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
+        """See :class:`DeviceSet`: with the errors of images there; where it is not seen, as at another place."""
+        seen = self._boards(row, points, views)
+        if seen is None or seen[0].view is None:
+            return like
+        camera, boards = seen
+        there = sees(camera, boards)
+        if not bool(there.any()):
+            return like
+        table: Any = like
+        boards = torch.where(there[:, None, None], boards, boards[there][0])
+        covariance, effects = expected(camera, boards)
+        return table.with_board_at(table.q, boards, (covariance, effects @ camera.root))
+
+    def _boards(self, row: int, points: Tensor, views: Mapping[str, View]) -> tuple[Camera, Tensor] | None:
+        """The camera of a row, and where it would see its board (M, 4, 4), m; None if the row is no image."""
         number = self.shared.seen_by[self.rows == row].tolist()
         if not number:
-            return super().sees(row, points, views)
+            return None
         name, camera = [*self.shared.cameras.items()][number[0]]
         poses = poses_from_marks(points, self.lever)
         for view in [view for set_up, view in views.items() if set_up.partition("/")[0] == name][-1:]:
             poses = view(poses)
-        return sees(camera, inverse_poses(poses) if self.on_tool else poses)
+        return camera, inverse_poses(poses) if self.on_tool else poses
 
     def placed(self) -> PlacedDevices:
         """See :class:`DeviceSet`."""

@@ -189,6 +189,10 @@ class Placed:
         """(M,) boolean: configurations that can be measured as the last row was: by a camera that sees its board."""
         return self.placement.sees(len(self.data) - 1, self.identification.geometry.points(q))
 
+    def measured_at(self, like: Any, q: Tensor) -> Any:
+        """M copies ``like`` of the last row as it would be measured at q (M, n), rad or m."""
+        return self.placement.measured_at(len(self.data) - 1, like, self.identification.geometry.points(q))
+
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
 

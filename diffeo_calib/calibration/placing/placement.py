@@ -200,6 +200,14 @@ class DeviceSet(ABC):
         """
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
+    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
+        """M copies ``like`` of a row at other joint values, as these devices would measure them there.
+
+        Args:
+            row: its number in the table. points: (M, P, 3) of the model there, m. views: those of all devices.
+        """
+        return like
+
     @abstractmethod
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -240,11 +248,21 @@ class Placement:
 
     def sees(self, row: int, points: Tensor) -> Tensor:
         """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""
-        views = {name: view for own in self.sets for name, view in own.views().items()}
-        found = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        views, found = self.views(), torch.ones(len(points), dtype=torch.bool, device=points.device)
         for own in self.sets:
             found &= own.sees(row, points, views)
         return found
+
+    def views(self) -> dict[str, View]:
+        """Those of all devices, see :meth:`DeviceSet.views`."""
+        return {name: view for own in self.sets for name, view in own.views().items()}
+
+    def measured_at(self, row: int, like: T, points: Tensor) -> T:
+        """See :meth:`DeviceSet.measured_at`."""
+        views = self.views()
+        for own in self.sets:
+            like = own.measured_at(row, like, points, views)
+        return like
 
     def shared(self, data: SeenRows) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""

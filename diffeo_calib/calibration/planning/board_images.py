@@ -98,13 +98,15 @@ def board_images(model: CalibratedKinematics, placed: PlacedDevices) -> list[Sen
 def _of_camera(model: CalibratedKinematics, placed: PlacedDevices, number: int, seen: BoardCamera) -> BoardImages:
     """One camera, where it stood last."""
     rows, noise = placed.rows[placed.device == number], model.map.noise
-    set_up = SetUp.of(model, _last_session(model, rows))
+    set_up = SetUp.of(model, _last_session(model, rows) or _own_place(model, placed.names[number]))
     found = BoardImages(None, placed.names[number], seen, model.bodies.pose_lever(), set_up)
     if seen.camera.view is None or model.registration is not None:
         return found
     stood = _same_session(model, rows)
     points = model(model.configurations[stood]).detach().flatten(1)
     known, by_lens = found.tells(points)
+    if not len(stood) or not bool(by_lens.isfinite().all()):  # it was seen from other places since
+        return found
     of_fit = noise.shared[stood][:, :9].clone()
     if set_up.columns is not None:
         of_fit[..., set_up.columns] = 0.0
@@ -122,6 +124,12 @@ def _last_session(model: CalibratedKinematics, rows: Tensor) -> str | None:
             here = torch.isin(own.rows, rows)
             return own.names[int(own.device[here][own.rows[here].argmax()])] if bool(here.any()) else None
     return None
+
+
+def _own_place(model: CalibratedKinematics, camera: str) -> str | None:
+    """Name of the last set-up of one of several cameras, where no row says it: that of a recalibration."""
+    sets = () if model.registration is not None else (own for own in model.placement if own.kind in TRANSFORMS)
+    return next((name for own in sets for name in reversed(own.names) if name.partition("/")[0] == camera), None)
 
 
 def _same_session(model: CalibratedKinematics, rows: Tensor) -> Tensor:

@@ -337,10 +337,10 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     fitted = model.map
     groups = q.split(PREDICT_ROWS)
     points, parts = zip(*(fitted.geodesic.linearised_value(rows) for rows in groups), strict=True)
-    features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
     noise, adrift = fitted.new_noise, fitted.workspace is not None
-    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
     seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
+    features = (_features(fitted, at, rows, free, seen) for at, rows in zip(parts, groups, strict=True))
+    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
     shifts = noise.new_zeros(0, 0)
     if fitted.noise.shared.shape[2] and fitted.registration is None:
         shifts = _conditional(fitted).shift_features()
@@ -362,8 +362,11 @@ def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
     return fitted.x[:0]
 
 
-def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None) -> Features:
-    """Features of a linearisation at q, and of what may have moved."""
+def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None, seen: int) -> Features:
+    """Features of a linearisation at q, and of what may have moved: of the markers the first ``seen`` coordinates.
+
+    A ball beside them stays on its tool: no row of the device would say where it is now.
+    """
     known = _conditional(fitted).features(at)
     added = []
     if fitted.registration is not None:
@@ -376,7 +379,7 @@ def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None)
         points = at.task[-1].points.view(len(q), -1, 3)
         added.append(PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
     if free in ("marker", "both"):
-        added.append(PLACES.found_m_rad * _by_marker(fitted, at, q))
+        added.append(PLACES.found_m_rad * _by_marker(fitted, at)[..., :seen])
     more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
     return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
 
@@ -386,11 +389,11 @@ def _either(first: str | None, second: str) -> str:
     return second if first is None or first == second else "both"
 
 
-def _by_marker(fitted: FittedMap, at: Linearisation, q: Tensor) -> Tensor:
+def _by_marker(fitted: FittedMap, at: Linearisation) -> Tensor:
     """Derivatives of the markers by their places on the flange: (M, m, m)."""
     nominal = fitted.geodesic.spec.nominal
     if isinstance(nominal, FlangePoints):
-        return marker_slopes(fitted.geodesic, nominal, q)
+        return marker_slopes(fitted.geodesic, nominal, at)
     if not isinstance(nominal, GeometryMap):
         raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
     return at.sensitivity[..., nominal.geometry.slices["tool"]]

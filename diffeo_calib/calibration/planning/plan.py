@@ -24,7 +24,7 @@ from diffeo_calib.calibration.planning.knowledge import (
     tool_of,
 )
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
+from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
@@ -267,7 +267,7 @@ def plan(
         **_in_order(robot, q, options.some(found.order), int(at_candidates[0])),
         expected_rms=(3 * found.variance).sqrt(),
         known_rms=known_rms,
-        noise_rms=_rms(start.scene.along(start.scene.noise[at_targets])),
+        noise_rms=_noise_rms(start.scene, sensors, at_targets),
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
@@ -292,6 +292,8 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
     if not several or not all(isinstance(one, Sensor) for one in several):
         fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
         raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
+    if isinstance(given, CalibratedKinematics) and without_positions(given):
+        return tuple(one.beside_others() for one in several)
     return several
 
 
@@ -350,6 +352,12 @@ def _known_rms(
 def _rms(blocks: Tensor) -> float:
     """RMS distance of covariances (M, r, r), m^2."""
     return float(3 * blocks.diagonal(dim1=1, dim2=2).mean()) ** 0.5
+
+
+def _noise_rms(scene: Scene, sensors: Sequence[Sensor], targets: Tensor) -> float:
+    """RMS noise of a measured position, m: of the first sensor with positions of a stated deviation, or of the rows."""
+    stated = next((one.std for one in sensors if one.of_positions and one.std is not None), None)
+    return _rms(scene.along(scene.noise[targets])) if stated is None else 3**0.5 * stated
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:

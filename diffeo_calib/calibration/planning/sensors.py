@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -206,6 +206,10 @@ class Sensor(ABC):
         """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
         return torch.nn.functional.pad(shared, (scene.shifts, 0))
 
+    def beside_others(self) -> Sensor:
+        """The same for a model whose rows no device of positions measured, for which it is a new one."""
+        return self
+
     def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
         """Covariance (O, r, r) of what rows show, m^2."""
         if self.std is None:
@@ -219,13 +223,18 @@ class Positions(Sensor):
     """Positions of the markers, or poses.
 
     Args:
-        whole: whether poses of frames are measured, or their origins.
+        whole: whether poses of frames are measured, or their origins. new: whether by a device of no row of the model.
     """
 
     whole: bool = False
+    new: bool = False
+
+    def beside_others(self) -> Sensor:
+        """See :meth:`Sensor.beside_others`."""
+        return replace(self, new=True)
 
     def options(self, scene: Scene) -> Options:
-        """At every configuration. Where nothing says where the robot stands, the place of the device is unknown."""
+        """At every configuration. The place of a new device is unknown, and where nothing says where the robot is."""
         N, m = scene.points.shape
         if self.whole and not scene.framed:
             fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
@@ -233,7 +242,7 @@ class Positions(Sensor):
         every = torch.eye(m, dtype=scene.points.dtype, device=scene.points.device)
         slopes = (every if self.whole else scene.averaged[: scene.seen]).expand(N, -1, -1)
         shared = slopes.new_zeros(N, m, 0)
-        if scene.free:
+        if scene.free or self.new:
             points = scene.points.view(N, -1, 3)
             shared = PLACES.found_m_rad * frame_slopes(points, points.mean((0, 1)))
         rows = torch.arange(N, device=slopes.device)
@@ -260,10 +269,14 @@ class DeviceReadings(Sensor):
         devices: where they are, in the robot's base frame.
         columns: (c0,) boolean, the shifts of the fit that are theirs; None for new devices. The devices of a fit are in
             the frame of the model's positions.
+        noise: (r, r) of a reading by rows of the fit, m^2; None where there are none.
+        around: whether these new devices are in that frame too: they were placed around the model since.
     """
 
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
     columns: Tensor | None = None
+    noise: Tensor | None = None
+    around: bool = False
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -284,7 +297,8 @@ class DeviceReadings(Sensor):
 
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the tool."""
-        base = scene.base if self.columns is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
+        in_base = self.columns is None and not self.around
+        base = scene.base if in_base else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
         last = scene.seen_by(self.devices)
         points = (scene.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]
         points, turn = (points @ base[:3, :3]).flatten(1), torch.block_diag(*[base[:3, :3].mT] * points.shape[1])
@@ -301,6 +315,12 @@ class DeviceReadings(Sensor):
             shared = own.new_zeros(*own.shape[:2], scene.shifts)
             shared[..., self.columns] = own
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
+
+    def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
+        """Covariance (O, r, r) of readings, m^2."""
+        if self.std is None and self.noise is not None:
+            return self.noise.expand(len(rows), -1, -1)
+        return super()._noise(scene, rows, slopes)
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.board_images import board_images
 from diffeo_calib.calibration.planning.sensors import DeviceReadings, InSockets, Positions, Sensor
+from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.sensors.devices import Devices
@@ -26,39 +29,104 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     which keeps the slopes of its rows and the effects of its devices.
     """
     fitted, q, known = model.map, model.configurations, _known_devices(model)
-    shared, visible = fitted.noise.shared, fitted.noise.visible
-    moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
-    read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
-    for rows, _ in known:
-        read[rows] = True
-    cameras, imaged = [own for own in model.placement if own.cameras], torch.zeros_like(read)
-    for own in cameras:
-        imaged[own.rows] = True
-    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & ~imaged & of_ball
-    device = Positions(whole=model.lever is not None)
-    found: list[Sensor] = [device] if bool((~read & ~resting & ~imaged).any()) else []
-    found += [camera for own in cameras for camera in board_images(model, own)]
+    shared = fitted.noise.shared
+    measured, read, resting = _rows_by_sensor(model)
+    found: list[Sensor] = [Positions(whole=model.lever is not None)] if bool(measured.any()) else []
+    found += [camera for own in model.placement for camera in board_images(model, own)]
     if bool(resting.any()):
         found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
+    moved = (shared != 0).any(1)  # (N, c) unknowns of a row
     if known:
-        return (*found, *(DeviceReadings(None, devices, moved[rows].any(0)) for rows, devices in known))
+        return (*found, *(_known(model, rows, devices, moved) for rows, devices in known))
     for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
         found.append(_device(model, (rows, own), _name(model, rows)))
     return tuple(found)
 
 
+def without_positions(model: CalibratedKinematics) -> bool:
+    """Whether no device of positions or poses measured rows of a model."""
+    return not bool(_rows_by_sensor(model)[0].any())
+
+
+def _rows_by_sensor(model: CalibratedKinematics) -> tuple[Tensor, Tensor, Tensor]:
+    """(N,) boolean: rows of the fit that tell positions or poses, readings, and a ball in sockets, but for images.
+
+    The device of rows that a recalibration added is not known: images among them share the errors of lens and board.
+    """
+    fitted = model.map
+    shared, visible = fitted.noise.shared, fitted.noise.visible
+    of_ball, count = torch.full_like(visible[:, 0], model.ball), visible.sum(1)
+    read = (count <= MOST_NUMBERS) & of_ball if fitted.slopes is not None else torch.zeros_like(of_ball)
+    body = 3 * fitted.m // len(model.bodies.averaging(fitted.new_noise))  # numbers of a marker, or of a pose
+    read |= count % body != 0
+    imaged = torch.zeros_like(read)
+    for own in model.placement:
+        if own.devices is not None:
+            read[own.rows] = True
+        if own.cameras:
+            imaged[own.rows] = True
+            imaged |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
+    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & ~imaged & of_ball
+    return ~read & ~resting & ~imaged, read & ~imaged, resting
+
+
+def _known(model: CalibratedKinematics, rows: Tensor, devices: Devices, moved: Tensor) -> DeviceReadings:
+    """A device with the rows (M,) of the fit that it measured, and (N, c) the unknowns of every row.
+
+    Of one that measured none nothing is known but its rough place.
+    """
+    if not len(rows):
+        return DeviceReadings(None, devices, around=True)
+    return DeviceReadings(None, devices, moved[rows].any(0), _noise(model, rows))
+
+
+def _noise(model: CalibratedKinematics, rows: Tensor) -> Tensor:
+    """(r, r) noise of the readings of a device by its rows (M,) of the fit, m^2."""
+    noise = model.map.noise
+    numbers = noise.visible[rows][0]
+    return noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
+
+
 def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
-    """Every device of readings of a model by itself, and the rows (M,) of the fit that it measured."""
-    found, noise = [], model.map.noise
+    """Every device of readings of a model by itself, and the rows (M,) of the fit that it measured, if any."""
+    found, noise, taken = [], model.map.noise, list[Tensor]()
     for one in model.placement:
-        for number in one.device.unique().tolist() if one.devices is not None else ():
-            rows, kind = one.rows[one.device == number].to(noise.shared.device), known_kinds()[one.kind]
-            effects = noise.shared[rows[0], noise.visible[rows[0]]]
-            offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
-            prior, name = one.constants.new_tensor(kind.prior(offset)), _called(model, one, number)
-            found.append((rows, kind((name,), one.constants[number, None], prior)))
+        for number in range(len(one.names)) if one.devices is not None else ():
+            kind, name = known_kinds()[one.kind], _called(model, one, number)
+            rows = one.rows[one.device == number].to(noise.shared.device)
+            device = kind((name,), one.constants[number, None], one.deviations[number])
+            rows = rows if len(rows) else _unnamed_rows(model, device, taken)
+            offset = 0.0
+            if len(rows):
+                taken.append(rows)
+                effects = noise.shared[rows[0], noise.visible[rows[0]]]
+                offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
+            found.append((rows, replace(device, deviations=one.constants.new_tensor(kind.prior(offset)))))
     return found
+
+
+def _unnamed_rows(model: CalibratedKinematics, device: Devices, taken: list[Tensor]) -> Tensor:
+    """(M,) rows of the fit that a device measured by their slopes, but for some that are taken; mostly of one kind.
+
+    A recalibrated or registered model does not know the devices of its rows.
+    """
+    fitted, none = model.map, model.map.noise.shared.new_zeros(0).long()
+    if fitted.slopes is None:
+        return none
+    moved, visible = (fitted.noise.shared != 0).any(1), fitted.noise.visible
+    read, width = _rows_by_sensor(model)[1], 3 * device.seen_points
+    for rows in taken:
+        read[rows] = False
+    unknowns = {len(device.prior(std)) for std in (0.0, 1.0)}
+    for own in moved[read].unique(dim=0) if bool(read.any()) else ():
+        rows = ((moved == own).all(1) & read).nonzero()[:, 0]
+        slopes = fitted.slopes[rows][:, visible[rows[0]], -width:]
+        again = device.observation(torch.zeros_like(rows)).slope(fitted.fitted_points[rows, -width:])
+        same = again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES
+        if same and int(own.sum()) in unknowns:
+            return rows
+    return none
 
 
 def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
@@ -105,6 +173,6 @@ def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) 
         devices = kind((name,), constants[None], deviations)
         again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
-            return DeviceReadings(None, devices, columns)
+            return DeviceReadings(None, devices, columns, _noise(model, rows))
     fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
     raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)

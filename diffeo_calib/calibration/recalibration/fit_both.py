@@ -131,7 +131,8 @@ def _shared(rows: NewRows, drifts: list[Drift]) -> tuple[Tensor, Tensor]:
     points = FlangePoints(fitted, fitted.geometry.tool, same=True)
     places = old.measured() if old.slopes is None else old.fitted_points
     around = {"centre": rows.centre, "marker_deviation": rows.marker_deviation}
-    moved = device_shifts(rows.before, points, old.x, places=places.unflatten(1, (-1, 3)), **around)
+    at = old.geodesic.with_nominal(points).linearise(old.x)
+    moved = device_shifts(rows.before, points, at, places=places.unflatten(1, (-1, 3)), **around)
     columns = [old.noise.shared, moved if old.slopes is None else old.slopes @ moved]
     if drifts:
         at = old.geodesic.linearise(None if old.data is None else old.x)

@@ -137,14 +137,14 @@ class NewRows:
         """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
         places = self.seen[0].unflatten(1, (-1, 3))
         around = {"centre": self.centre, "marker_deviation": self.marker_deviation}
-        found = device_shifts(self.before, self.points, self.q, places=places, **around)
+        found = device_shifts(self.before, self.points, self.seen[1], places=places, **around)
         return torch.cat([found if self.slopes is None else self.slopes @ found, self.by_devices], 2)
 
     @cached_property
     def by_devices(self) -> Tensor:
         """(M, R, c) effect of the devices that stand around the old model."""
         tool = self.before.nominal.geometry.slices["tool"]
-        S = marker_slopes(self.fitted.geodesic.with_nominal(self.points), self.points, self.q)
+        S = marker_slopes(self.fitted.geodesic, self.points, self.seen[1])
         S = torch.nn.functional.pad(S if self.slopes is None else self.slopes @ S, (tool.start, 0))
         shown = SeenRows(self.before.nominal, self.y, self.seen[0], self.slopes, S)
         found = self.placement.shared(shown)
@@ -399,22 +399,22 @@ def usual_variance(noise: Noise) -> float:
 
 
 def device_shifts(
-    before: Before, points: FlangePoints, q: Tensor, *, places: Tensor, centre: Tensor, marker_deviation: float
+    before: Before, points: FlangePoints, at: Linearisation, *, places: Tensor, centre: Tensor, marker_deviation: float
 ) -> Tensor:
     """Effect of shifts and turns of the measuring device about a centre, and of the markers on the flange.
 
     Only where a device measured coordinates its frame may have moved, and of the markers those that were seen.
 
     Args:
-        before: the old map, and what may have moved. points: nominal map of the markers. q: (N, n).
+        before: the old map, and what may have moved. points: nominal map of the markers.
+        at: the old map around these, at N configurations.
         places: (N, P, 3) where they are, m. centre: (3,) m. marker_deviation: prior standard deviation, m.
 
     Returns:
         (N, 3 P, c) columns of unit prior variance, m.
     """
-    geodesic = before.fitted.geodesic.with_nominal(points)
     moving = before.seen_before.repeat_interleave(3)
-    markers = marker_deviation * marker_slopes(geodesic, points, q)[..., moving]
+    markers = marker_deviation * marker_slopes(before.fitted.geodesic, points, at)[..., moving]
     if before.place is None:
         return markers
     return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)

@@ -12,6 +12,8 @@ is gamma-distributed to a good approximation, with mean tr(M^-1 C_i) and varianc
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -59,7 +61,8 @@ def new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
     whole = data.nominal.jacobian(data.x, data.theta)
     if data.beside is None:
         return _typical(data, NoiseModel(whole.shape[1] // 3), whole, scales)
-    known, ball = new_noise(data.beside, scales), _typical(data, NoiseModel(1), whole[:, -3:], scales)
+    beside = replace(data.beside, tails=data.tails)  # their own are those of the geometric calibration
+    known, ball = new_noise(beside, scales), _typical(data, NoiseModel(1), whole[:, -3:], scales)
     return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
 
 

@@ -107,7 +107,7 @@ class Session:
         points = FlangePoints(self.nominal, body.points, same=self.same)
         deformation = self.fitted.geodesic.with_nominal(points)
         value, at = deformation.linearised_value(self.q)
-        slopes = marker_slopes(deformation, points, self.q) @ body.slopes
+        slopes = marker_slopes(deformation, points, at) @ body.slopes
         C = self.fitted.covariance_between(at) if covariance is None else covariance
         return View(value.unflatten(1, (-1, 3)), slopes, C)
 

@@ -85,7 +85,8 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
 def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
     points = _points(model)
     old = model.bodies.at(points.points)
-    slopes = marker_slopes(model.map.geodesic.with_nominal(points), points, q) @ old.slopes  # (N, m, d)
+    geodesic = model.map.geodesic.with_nominal(points)
+    slopes = marker_slopes(geodesic, points, geodesic.linearise(q)) @ old.slopes  # (N, m, d)
     seen = ~errors.isnan()
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step

@@ -176,7 +176,7 @@ class RegisteredMap(FittedMap):
     ) -> Tensor:
         """That of the fit and of the registration."""
         points: Any = geodesic.spec.nominal
-        added = self._added(at, marker_slopes(geodesic, points, rows))
+        added = self._added(at, marker_slopes(geodesic, points, at))
         fitted = self.fitted.with_second_order(self.fitted.covariance_at(at, directions))
         return fitted + _along(directions, added)
 
@@ -228,9 +228,9 @@ class RegisteredMap(FittedMap):
     def place_slopes(self, q: Tensor) -> Tensor:
         """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
         rows = q.to(self.deformation.x.device)
-        points = self.geodesic(rows).detach().view(len(rows), -1, 3)
-        S = frame_slopes(points, self.registration.centre.to(points))
-        return torch.cat([S, marker_slopes(self.geodesic, self.points, rows)], -1).flatten(0, 1)
+        points, at = self.geodesic.linearised_value(rows)
+        S = frame_slopes(points.detach().view(len(rows), -1, 3), self.registration.centre.to(points))
+        return torch.cat([S, marker_slopes(self.geodesic, self.points, at)], -1).flatten(0, 1)
 
     @cached_property
     def _rows(self) -> Linearisation:
@@ -253,13 +253,14 @@ def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
     return torch.cat([eye, -skew(points - centre)], dim=-1).flatten(1, 2)
 
 
-def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, q: Tensor) -> Tensor:
-    """Derivatives of k1 by shifts of its own points in the tip's frame, Dpsi R_tip: (N, n) -> (N, 3 P, 3 P)."""
-    theta = deformation.momenta.theta
-    xi = deformation.joint_flow(q)
-    _, by_point = deformation.task_flow.with_jacobian(points(xi, theta).view(-1, 3))
-    shifts = points.shifts(xi, theta)  # (N, 3 P, 3 P)
-    return (by_point @ shifts.view(len(by_point), 3, -1)).view(shifts.shape)
+def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:
+    """Derivatives of k1 by shifts of its own points in the tip's frame, Dpsi R_tip: (N, 3 P, 3 P).
+
+    Args:
+        deformation: k1. points: its nominal map. at: its linearisation at N configurations.
+    """
+    shifts = points.shifts(at.xi, deformation.momenta.theta)  # (N, 3 P, 3 P)
+    return (at.by_task_points @ shifts.view(len(at.by_task_points), 3, -1)).view(shifts.shape)
 
 
 def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
