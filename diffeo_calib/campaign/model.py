@@ -130,10 +130,12 @@ class CampaignModel:
         return made
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
-        """The same places and scales with the posterior of the rows that are accepted now."""
-        accepted = [one.row for one in verdicts if one.accepted]
+        """The same places and scales with the posterior of the rows that are accepted now, of devices that it knows."""
+        placed, names = set(self.placed.data.device_names), table.device_names
+        judged = [one for one in verdicts if names[one.row] in placed]
+        accepted = [one.row for one in judged if one.accepted]
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
-        window = [one.row for one in verdicts[-LIMITS.window :] if one.row >= first]
+        window = [one.row for one in judged[-LIMITS.window :] if one.row >= first]
         old = [row for row in accepted if row not in window]
         known = self.placed.data.line_numbers.tolist()
         place_of = {row: number for number, row in enumerate(known)}

@@ -319,3 +319,18 @@ def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
         assert needed is None or found.needed == needed
     with pytest.raises(InputError, match="goal"):
         dc.Campaign(arm.nominal, goal=0.0)
+
+
+def test_decisions_while_a_set_up_is_not_placed_yet(measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[:21] for part in measured)
+    first, second = (dc.Measurements(q[some], y[some]) for some in (slice(0, 20), slice(20, 21)))
+    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
+    campaign.add(first.with_sessions(["monday"] * 20))
+    (open_,) = campaign.add(second.with_sessions(["tuesday"]))
+    assert open_.fits is None
+    for row in (7, 20):
+        before = campaign.expected_error
+        campaign.reject(row)
+        assert campaign.accepted == [other for other in range(21) if other != row]
+        campaign.accept(row)
+        assert campaign.expected_error == pytest.approx(before)
