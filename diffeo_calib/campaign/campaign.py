@@ -51,7 +51,7 @@ class Campaign:
     Args:
         robot: nominal chain, n joints.
         candidates: (M, n) configurations that can be measured, rad or m; drawn within the joint limits by default, and
-            where a camera sees its board near the rows so far. Those at which it does not are never proposed.
+            near the rows so far where a camera sees its board or the ball rests in a socket. Others are never proposed.
         target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
         goal: RMS error over the target to reach, m, see :attr:`reached`.
         background: whether models are renewed in a thread of their own: a call then never waits for one, and verdicts

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from math import inf, pi
 from typing import Any, NamedTuple
 
@@ -130,10 +131,12 @@ class CampaignModel:
         return made
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
-        """The same places and scales with the posterior of the rows that are accepted now."""
-        accepted = [one.row for one in verdicts if one.accepted]
+        """The same places and scales with the posterior of the rows that are accepted now, of devices that it knows."""
+        placed, names = set(self.placed.data.device_names), table.device_names
+        judged = [one for one in verdicts if names[one.row] in placed]
+        accepted = [one.row for one in judged if one.accepted]
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
-        window = [one.row for one in verdicts[-LIMITS.window :] if one.row >= first]
+        window = [one.row for one in judged[-LIMITS.window :] if one.row >= first]
         old = [row for row in accepted if row not in window]
         known = self.placed.data.line_numbers.tolist()
         place_of = {row: number for number, row in enumerate(known)}
@@ -148,7 +151,7 @@ class CampaignModel:
         last = posterior.see(Rows.of(self.around(table, window).data, self.scales))
         taken = _flags([verdicts[row].accepted for row in window])
         own = {"posterior": posterior, "window": window, "last": last, "taken": taken, "ratios": list(self.ratios)}
-        own |= {"compared": _compared(self.placed, asked[0]), "open": self.placed.sees(self.asked[0])}
+        own |= {"compared": _compared(self.placed, asked[0]), "open": self.placed.sees(self.like, self.asked[0])}
         return replace(self, **own, seen=len(table))
 
     def check_placed(self) -> None:
@@ -167,9 +170,15 @@ class CampaignModel:
         robot = self.placed.registration.geometry.chain
         with suppress(InputError):  # hardly any can
             near = ranges_around(robot, self.placed.data.q)
-            q = candidates(robot, count, keep=self.placed.sees, ranges=near, seed=seed)
+            own: Any = {"ranges": near, **self.placed.places_to_reach(self.like)}
+            q = candidates(robot, count, keep=partial(self.placed.sees, self.like), seed=seed, **own)
             return replace(self, asked=(q, self.asked[1])).rebuilt(table, verdicts)
         return self
+
+    @cached_property
+    def like(self) -> int:
+        """Number of the row of the model as which the candidates would be measured, see :meth:`Placed.row_like`."""
+        return self.placed.row_like(self.asked[0])
 
     @property
     def expected_error(self) -> float:
@@ -324,10 +333,10 @@ class CampaignModel:
         return Around(data.rows(index), lambda: placed.placement.changes(seen_rows(data)), index)
 
     def _asked(self, table: Any) -> tuple[Rows, Rows]:
-        """The target, and the candidates as if they were measured like the last row."""
-        candidates = self.asked[0]
-        last = self.placed.data.line_numbers[-1:].tolist() * len(candidates)
-        like = self.placed.measured_at(with_joints(table.rows(last), candidates), candidates)
+        """The target, and the candidates as if they were measured like the row :attr:`like`."""
+        candidates, row = self.asked[0], self.like
+        rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
+        like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
         return self.target(self.scales), Rows.of(self._around(like).data, self.scales)
 
     def target(self, scales: Hyperparameters) -> Rows:

@@ -319,3 +319,39 @@ def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
         assert needed is None or found.needed == needed
     with pytest.raises(InputError, match="goal"):
         dc.Campaign(arm.nominal, goal=0.0)
+
+
+def test_decisions_while_a_set_up_is_not_placed_yet(measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[:21] for part in measured)
+    first, second = (dc.Measurements(q[some], y[some]) for some in (slice(0, 20), slice(20, 21)))
+    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
+    campaign.add(first.with_sessions(["monday"] * 20))
+    (open_,) = campaign.add(second.with_sessions(["tuesday"]))
+    assert open_.fits is None
+    for row in (7, 20):
+        before = campaign.expected_error
+        campaign.reject(row)
+        assert campaign.accepted == [other for other in range(21) if other != row]
+        campaign.accept(row)
+        assert campaign.expected_error == pytest.approx(before)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+def test_next_poses_of_a_ball_are_in_sockets() -> None:
+    kind = kind_named("ball in sockets")
+    rows, q = kind.source.golden.rows, kind.q(30)
+    ball, own = kind.model(rows.q).detach()[:, -1], rows.socket_numbers
+    sockets = torch.stack([ball[own == number].mean(0) for number in own.unique()])
+    drawn, given = dc.Campaign(kind.robot, target=q), dc.Campaign(kind.robot, candidates=q, target=q)
+    for campaign in (drawn, given):
+        campaign.add(rows)
+    found = drawn.next(5)
+    assert found is not None
+    assert len(found.q) == 5
+    away = torch.cdist(kind.model(found.q).detach()[:, -1], sockets).amin(1)
+    assert float(away.max()) < 0.03
+    assert found.expected[5] < found.expected[0]
+    none = given.next(5)
+    assert none is not None
+    assert len(none.q) == 0

@@ -185,13 +185,26 @@ class Placed:
                 return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
         return shown_unit("m")
 
-    def sees(self, q: Tensor) -> Tensor:
-        """(M,) boolean: configurations that can be measured as the last row was: by a camera that sees its board."""
-        return self.placement.sees(len(self.data) - 1, self.identification.geometry.points(q))
+    def row_like(self, q: Tensor) -> int:
+        """Number of the last row as which some of the configurations q (M, n) can be measured; else the very last."""
+        last = len(self.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self.sees(row, q).any())), last)
 
-    def measured_at(self, like: Any, q: Tensor) -> Any:
-        """M copies ``like`` of the last row as it would be measured at q (M, n), rad or m."""
-        return self.placement.measured_at(len(self.data) - 1, like, self.identification.geometry.points(q))
+    def sees(self, row: int, q: Tensor) -> Tensor:
+        """(M,) boolean: configurations that can be measured as a row was, by a camera that sees its board."""
+        return self.placement.sees(row, self.identification.geometry.points(q))
+
+    def places_to_reach(self, row: int) -> dict[str, Tensor]:
+        """Where configurations bring the ball that are measured as a row was: see :func:`candidates`."""
+        found, geometry = self.placement.places_at(row), self.identification.geometry
+        if found is None:
+            return {}
+        base = geometry.base.to(found)
+        return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+
+    def measured_at(self, row: int, like: Any, q: Tensor) -> Any:
+        """M copies ``like`` of a row as it would be measured at q (M, n), rad or m."""
+        return self.placement.measured_at(row, like, self.identification.geometry.points(q))
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.

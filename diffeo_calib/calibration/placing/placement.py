@@ -208,6 +208,10 @@ class DeviceSet(ABC):
         """
         return like
 
+    def places_at(self, row: int) -> Tensor | None:
+        """(D, 3) places in the measuring frame, m, to which a row of this kind brings the ball; None for anywhere."""
+        return None
+
     @abstractmethod
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -263,6 +267,10 @@ class Placement:
         for own in self.sets:
             like = own.measured_at(row, like, points, views)
         return like
+
+    def places_at(self, row: int) -> Tensor | None:
+        """See :meth:`DeviceSet.places_at`."""
+        return next((places for own in self.sets if (places := own.places_at(row)) is not None), None)
 
     def shared(self, data: SeenRows) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""

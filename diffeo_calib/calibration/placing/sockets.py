@@ -10,8 +10,9 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -49,13 +50,18 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
+from diffeo_calib.sensors.mounted import View
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
+
+T = TypeVar("T")
 
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
+IN_SOCKET_M = 0.02
+"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 
@@ -177,6 +183,25 @@ class SocketDevices(DeviceSet):
     def at_places(self, table: Measurements) -> Measurements:
         """See :class:`DeviceSet`."""
         return self.places.placed(self.named(table))
+
+    def places_at(self, row: int) -> Tensor | None:
+        """See :class:`DeviceSet`: all sockets."""
+        return None if self.socket[row] == NO_SOCKET else self.positions
+
+    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
+        """See :class:`DeviceSet`: whether the ball is near a socket."""
+        places = self.places_at(row)
+        if places is None:
+            return super().sees(row, points, views)
+        return torch.cdist(points[:, -1], places.to(points)).amin(1) < IN_SOCKET_M
+
+    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
+        """See :class:`DeviceSet`: in the nearest socket."""
+        places = self.places_at(row)
+        if places is None:
+            return like
+        nearest = torch.cdist(points[:, -1], places.to(points)).argmin(1)
+        return with_attributes(like, socket=nearest, sockets=self.places.sockets)
 
     @property
     def names(self) -> tuple[str, ...]:

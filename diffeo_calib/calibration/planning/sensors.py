@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.placing.sockets import IN_SOCKET_M
 from diffeo_calib.calibration.planning.candidates import Criterion
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
@@ -22,9 +23,6 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
-
-IN_SOCKET_M = 0.02
-"""Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
 
 
 class Scene(NamedTuple):
