@@ -244,14 +244,21 @@ def _other_tips(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values with one mistake undone."""
-    for q, words in _corrections_of_joints(robot, data):
+    for q, words in corrections_of_joints(robot, data):
         yield Reading(robot, q, data.points, words, on=data.on or ())
 
 
-def _corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
+def corrections_of_angles(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]]:
+    """Joint values (N, n) in another unit of angles, with the mistake that it undoes."""
+    turning = torch.tensor(robot.periodic, dtype=torch.bool, device=q.device)
+    for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
+        yield torch.where(turning, factor * q, q), angle_mistake(words)
+
+
+def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
+    """Joint values (N, n) with one mistake undone, and the mistake."""
     names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
-    for factor, words in ANGLE_MISTAKES:
-        yield torch.where(turning, factor * data.q, data.q), angle_mistake(words)
+    yield from corrections_of_angles(robot, data.q)
     for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
         q = torch.where(turning, data.q, factor * data.q)
         yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
