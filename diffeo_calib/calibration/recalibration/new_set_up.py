@@ -22,6 +22,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
+from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
@@ -33,7 +34,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, check_shown
+from diffeo_calib.sensors.coordinates import check_shown
 from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
@@ -164,9 +165,7 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 
 
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
-    check_joint_order(model.robot, new)
-    check_payload_link(model.nominal.load.link, new)
-    model.robot.joint_values(new.q)
+    check_same_robot(model, new)
     model.nominal.load.under(new.payload).checked()
 
 
