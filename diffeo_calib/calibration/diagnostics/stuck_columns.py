@@ -131,7 +131,10 @@ def warn_of_outliers(wrong: Sequence[int], data: Any, reason: str, stuck: Sequen
         warn_user(sentence(what, expected=expected, got=got, fix=fix + also))
     elif many:
         what = f"{counts} are outliers, so that they hardly count"
-        fix = "check these devices, their columns and units" + also
+        fix = (
+            "check these devices, their columns and units; of a set-up, whether more has moved than was said: leave it "
+        )
+        fix += "out, and recalibrate the model with its rows alone, which finds both device and markers" + also
         warn_user(sentence(what, expected=expected, got=got, fix=fix))
 
 
