@@ -18,6 +18,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
@@ -82,6 +83,10 @@ class Sensor(ABC):
     @abstractmethod
     def check(self, data: Any, model: Any) -> None:
         """Raise InputError or MeasurementError for rows that a model cannot be compared with."""
+
+    def rare(self, data: Any) -> list[str]:
+        """Names of places with too few rows to say anything, in words."""
+        return []
 
     def check_angles(self, data: Any, model: Any) -> None:  # noqa: B027
         """Raise MeasurementError for rows that fit a model far better with joint values in another unit of angles."""
@@ -226,6 +231,10 @@ class Contacts(Sensor):
         check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
         check_tips(data, model.on[-data.markers :])
 
+    def rare(self, data: Measurements) -> list[str]:
+        """Sockets with one row."""
+        return rare_names(data.row_sockets, data.line_numbers.tolist(), 2)
+
     def check_angles(self, data: Measurements, model: Any) -> None:
         """By the spread within sockets, relative to the motion of the tip, with which it shrinks."""
         if not model.ball:
@@ -253,10 +262,11 @@ class Contacts(Sensor):
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
-        count, lone = len(set(data.row_sockets) - {""}), int(alone(sockets_of(data)[0]).sum())
+        count, lone = len(set(data.row_sockets) - {""}), self.rare(data)
         found = [f"the middles of {count} sockets were found from these rows"]
         if lone:
-            found.append(f"{lone} of {len(data)} rows show no error: they are alone in their socket, so its middle")
+            what = f"{len(lone)} of {len(data)} rows show no error: they are alone in their socket, so its middle"
+            found.append(f"{what}: {few(lone)}")
         return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:

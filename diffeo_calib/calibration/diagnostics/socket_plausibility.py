@@ -22,6 +22,7 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
@@ -168,11 +169,11 @@ def check_sockets(robot: Tree, data: Measurements) -> None:
     check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
     resting = socket[socket != NO_SOCKET]
     counts = torch.bincount(resting, minlength=len(sockets.names))
-    single = [name for name, n in zip(sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
+    single = rare_names(data.row_sockets, data.line_numbers.tolist(), LIMITS.fewest_in_socket)
     if single:
         expected = f"at least {LIMITS.fewest_in_socket} rows in every socket, better 10 or more"
-        fix = "measure more rows there, with the tool turned and tilted otherwise, or leave it out"
-        raise MeasurementError.of(f"socket {few(single)}", expected=expected, got="1 row", fix=fix)
+        fix = "check the name, measure more rows there, with the tool turned and tilted otherwise, or leave it out"
+        raise MeasurementError.of("rows with sockets", expected=expected, got=few(single), fix=fix)
     needed = len(counts) + LIMITS.surplus
     if len(resting) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
