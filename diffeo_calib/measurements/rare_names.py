@@ -21,7 +21,12 @@ def rare_names(names: Sequence[str], lines: Sequence[int], fewest: int) -> list[
     for name, count in counts.items():
         if count < fewest:
             own = [line for line, other in zip(lines, names, strict=True) if other == name]
-            near = get_close_matches(name, usual, n=1)
+            near = get_close_matches(name, [other for other in usual if _digits(other) == _digits(name)], n=1)
             meant = "".join(f", perhaps meant as '{other}'" for other in near)
             found.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(own)}){meant}")
     return found
+
+
+def _digits(name: str) -> str:
+    """The digits of a name: names that differ in them, such as "0/0" and "0/1", are seldom meant for one another."""
+    return "".join(character for character in name if character.isdigit())

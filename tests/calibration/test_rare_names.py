@@ -32,12 +32,12 @@ def of_devices(data: dc.Readings, row: int, name: str) -> dc.Readings:
 
 def test_a_lone_socket_is_told_by_its_row() -> None:
     kind = kind_named("ball in sockets")
-    words = r"'0/00' in 1 row \(5\), perhaps meant as '0/0'"
+    words = r"'0/0x' in 1 row \(5\), perhaps meant as '0/0'"
     with pytest.raises(MeasurementError, match=words):
-        dc.calibrate(kind.robot, in_sockets(kind.data, 5, "0/00"), hyperparameters=kind.scales)
-    new, words = in_sockets(kind.new, 5, "4/00"), r"'4/00' in 1 row \(5\), perhaps meant as '4/0'"
+        dc.calibrate(kind.robot, in_sockets(kind.data, 5, "0/0x"), hyperparameters=kind.scales)
+    new, words = in_sockets(kind.new, 5, "4/0x"), r"'4/0x' in 1 row \(5\), perhaps meant as '4/0'"
     found = dc.evaluate(kind.model, new)
-    assert any("1 of 12 rows show no error" in text and "'4/00' in 1 row (5)" in text for text in found.placed)
+    assert any("1 of 12 rows show no error" in text and "'4/0x' in 1 row (5)" in text for text in found.placed)
     for verb in (dc.recalibrate, dc.compare):
         with pytest.warns(DiffeoCalibWarning, match=words):
             verb(kind.model, new)
@@ -53,6 +53,6 @@ def test_a_lone_session_is_told_by_its_row() -> None:
 
 def test_a_lone_device_is_told_by_its_row() -> None:
     kind = kind_named("heights")
-    words = r"'device 00' in 1 row \(6\), perhaps meant as 'device 0'"
+    words = r"'devise 0' in 1 row \(6\), perhaps meant as 'device 0'"
     with pytest.raises(MeasurementError, match=words):
-        dc.calibrate(kind.robot, of_devices(kind.data, 6, "device 00"), hyperparameters=kind.scales)
+        dc.calibrate(kind.robot, of_devices(kind.data, 6, "devise 0"), hyperparameters=kind.scales)

@@ -165,7 +165,16 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
         a phrase: the mistake that explains them, if there is one, else what to check.
     """
     good: list[tuple[float, Reading]] = []
-    for group in (_shifted, _mirrored, _other_tips, other_rotations, _other_joints, longer_chains, other_columns):
+    for group in (
+        _other_lengths,
+        _shifted,
+        _mirrored,
+        _other_tips,
+        other_rotations,
+        _other_joints,
+        longer_chains,
+        other_columns,
+    ):
         for reading in group(robot, data):
             residual = _residual(reading)
             if residual < LIMITS.remaining * typical:
@@ -217,6 +226,15 @@ def _residual(reading: Reading) -> float:
         return torch.inf
     geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
+
+
+def _other_lengths(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Positions in another unit; the points of a pose stay where they are beside its origin."""
+    bodies = data.points.unflatten(1, (data.origins.shape[1], -1))
+    for factor, words in ((1e3, "small"), (1e-3, "large")):
+        points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)
+        said = f"the positions seem to be 1000 times too {words}: check their unit (`length`, mm or m)"
+        yield Reading(robot, data.q, points, said, on=data.on or ())
 
 
 def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
