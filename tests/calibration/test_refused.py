@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from kind_bank import kind_named
 from product_bank import simulated, simulated_poses
 
 import diffeo_calib as dc
@@ -150,3 +151,16 @@ def test_deviations_in_another_unit(arm: Few) -> None:
     data = dc.Measurements(arm.rows.q, arm.rows.points, std=0.02)  # mm that were meant
     with pytest.raises(MeasurementError, match=r"given standard deviations cannot be right.*check `std` and its unit"):
         dc.calibrate(arm.robot, data)
+
+
+@pytest.mark.parametrize("name", ["poses", "several tips"])
+def test_poses_in_another_unit_of_lengths_are_told_so(name: str) -> None:
+    """The points that represent a pose keep a size of their own, which no check of sizes sees."""
+    kind = kind_named(name)
+    frames = kind.data.frames.clone()
+    frames[..., :3, 3] *= 1e-3
+    on = None if kind.data.on is None else kind.data.on[::3]
+    poses = frames if frames.shape[1] > 1 else frames[:, 0]
+    data = dc.Measurements.from_poses(kind.data.q, poses, kind.data.joint_names, on=on)
+    with pytest.raises(MeasurementError, match=r"positions seem to be 1000 times too small.*check their unit"):
+        dc.calibrate(kind.robot, data, hyperparameters=kind.scales)
