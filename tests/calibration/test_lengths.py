@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from golden_bank import sockets
 from reading_bank import readings, scales
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.image import Cameras
 
@@ -57,6 +61,23 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * clean.unnoticed[0]
     assert clean.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
     assert "may be wrong without a warning" in str(wrong.lengths[0])
+
+
+@pytest.mark.parametrize("rows", [48, 60])
+def test_sockets_without_a_known_distance_show_no_size(rows: int) -> None:
+    """Neither another one nor a change: what the ball differs within a socket is no motion."""
+    golden = sockets()
+    table: Any = golden.rows
+    table = table.rows(slice(0, rows))
+    table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        result = dc.calibrate(golden.robot, table, hyperparameters=golden.scales)
+    assert len(caught) == 1
+    assert "no distance between sockets is known" in str(caught[0].message)
+    size = result.lengths[0]
+    assert abs(size.value) < size.deviation
+    assert size.deviation > 0.01
 
 
 def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
