@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, simulated_poses, ur10_measurements
+from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import scales
 from tangent_bank import Setting, built, normal
 from torch import Tensor
@@ -114,7 +114,7 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
     points = from_row(data.points[:100], 50, torch.tensor([6e-4, 0.0, 8e-4], dtype=torch.float64))
     moved = dc.Measurements(data.q[:100], points)
     with pytest.warns(DiffeoCalibWarning, match="these rows do not tell which") as caught:
-        dc.calibrate(robot, moved)
+        dc.calibrate(robot, moved, hyperparameters=ur10_scales())
     (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
     assert text.count("moved by about 1 mm") == 2
     assert all(what in text for what in ("the measuring device", "a marker", "near row 50"))

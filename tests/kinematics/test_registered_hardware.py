@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from product_bank import ur10_measurements
+from product_bank import ur10_measurements, ur10_scales
 
 import diffeo_calib as dc
 from diffeo_calib.robots.se3 import twist_transform
 
-DRAWS = 2
+ROWS, DRAWS = 120, 2
+"""Rows of the model, and numbers of random choices of new ones."""
 
 
 @pytest.mark.slow
@@ -20,7 +21,7 @@ def test_a_tracker_that_moved_between_two_halves(ur10_folder: Path) -> None:
     """RMS on the other rows of the moved half, in units of that of the same model where nothing moved."""
     robot, data = ur10_measurements(ur10_folder)
     half, other = data.split(0.5, seed=0)
-    model = dc.calibrate(robot, half).model
+    model = dc.calibrate(robot, half[:ROWS], hyperparameters=ur10_scales()).model
     T = twist_transform(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.2, 0.4], dtype=torch.float64))
     moved = dc.Measurements(other.q, other.points @ T[:3, :3].mT + T[:3, 3], robot.joint_names)
     for rows, most in ((20, 1.05), (6, 1.25)):
@@ -47,7 +48,7 @@ def test_a_marker_that_the_fit_hardly_knew(ur10_folder: Path) -> None:
     columns = [f"measurement_{axis}" for axis in "xyz"]
     csv = ur10_folder / "measurements_grid_900.csv"
     other = dc.read_measurements(csv, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
-    model = dc.calibrate(robot, fitted.split(0.2, seed=0)[0]).model
+    model = dc.calibrate(robot, fitted.split(0.2, seed=0)[0], hyperparameters=ur10_scales()).model
     rows = torch.randperm(len(other), generator=torch.Generator().manual_seed(0))
     found = model.registered(other.rows(rows[:20]))
     assert dc.evaluate(found, other.rows(rows[20:])).rms < 6e-4  # held to its old place: 7 mm
