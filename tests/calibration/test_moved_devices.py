@@ -41,10 +41,11 @@ def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int
 
 @pytest.mark.slow
 def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
-    """0.5 mm from one row of 60 on; the error of the calibration is 0.04 mm."""
-    data = arm.train
+    """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
     change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    size, row = found(arm.robot, dc.Measurements(data.q, from_row(data.points, 25, change)), "the measuring device")
+    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
+    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
+    size, row = found(arm.robot, mixed, "the measuring device")
     assert size == pytest.approx(0.5, rel=0.3)
     assert abs(row - 25) <= 1
 
@@ -60,14 +61,6 @@ def test_a_marker_that_was_knocked_is_noticed(arm: Case) -> None:
     size, row = found(arm.robot, dc.Measurements(data.q, points), "a marker")
     assert size == pytest.approx(1.0, rel=0.3)
     assert abs(row - 40) <= 1
-
-
-@pytest.mark.slow
-def test_rows_in_another_order_are_judged_in_the_order_of_their_numbers(arm: Case) -> None:
-    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
-    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
-    assert abs(found(arm.robot, mixed, "the measuring device")[1] - 25) <= 1
 
 
 def test_the_gain_is_that_of_the_definition() -> None:
@@ -134,7 +127,7 @@ def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | 
     return next((text for text in texts if "seems to" in text), None)
 
 
-@pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (1, 5e-4), (2, 5e-4), (5, 2e-3)])
+@pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (2, 5e-4), (5, 2e-3)])
 def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) -> None:
     """From row 30 of 80 on; of the first and the last joint another cause explains as much."""
     arm = SimulatedArm(3)
