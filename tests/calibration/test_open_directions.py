@@ -115,7 +115,7 @@ def worst(model: dc.CalibratedKinematics, data: dc.Measurements) -> Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tool never turned", "one joint moves", "last joint locked"])
+@pytest.mark.parametrize("name", ["tool never turned", "one joint moves"])
 def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) -> None:
     arm, data = campaign(name, "1 marker", 15)
     far = measured(arm, "1 marker", joints(arm, 60, torch.Generator().manual_seed(9)), torch.Generator())
@@ -130,7 +130,6 @@ def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) 
     ("name", "kind", "seed"),
     [
         ("tool never turned", "poses", 0),
-        ("tool turned about the vertical", "3 markers", 0),
         ("two clusters", "poses", 1),
     ],
 )
