@@ -108,7 +108,7 @@ def test_old_rows_and_new_rows_together_are_one_calibration(arm: Case) -> None:
     assert dc.evaluate(twice, test).rms < 1.08 * dc.evaluate(once, test).rms
 
 
-@pytest.mark.parametrize(("joint", "size"), [(1, -3e-4), (2, 6e-4), (4, 1.5e-3)])
+@pytest.mark.parametrize(("joint", "size"), [(1, -3e-4), (4, 1.5e-3)])
 def test_a_moved_zero_is_named_with_its_size(arm: Case, joint: int, size: float) -> None:
     robot = simulated(1)[0]
     q, moved = robot.sample(NEW_ROWS, 5), torch.zeros(6, dtype=torch.float64)
@@ -212,13 +212,6 @@ def test_models_of_a_robot_before_and_after_wear(arm: Case) -> None:
     assert found.transmissions["elbow_joint"] == pytest.approx(truth, rel=0.3)
     assert found.rms > 2 * found.expected
     assert found.geodesic_length > 1.0
-
-
-def test_measurements_are_compared_without_a_fit(arm: Case) -> None:
-    found = dc.compare(arm.model, measured(worn(0, 2.5), NEW_ROWS, 5))
-    assert isinstance(found, dc.Comparison)
-    assert str(found).startswith("waist_joint has changed")
-    assert found.rms > found.expected
 
 
 def test_rows_outside_of_the_old_range_say_nothing_about_change(arm: Case) -> None:

@@ -65,6 +65,7 @@ def test_a_worn_joint_is_found(name: str) -> None:
     assert isinstance(found, dc.Comparison)
     assert [change.part for change in found.changes.found] == [worn.nominal.joint_names[again_bank.WORN]]
     (change,) = found.changes.found
+    assert str(found).startswith(f"{change.part} has changed")
     assert 1e-4 < change.size < 2e-3
     assert change.displacement > 1e-5
 

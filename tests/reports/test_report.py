@@ -57,7 +57,7 @@ def check_page(text: str) -> None:
     assert all(len(figure.xpath(".//*[local-name()='path']")) > 3 for figure in page.iter("figure"))
 
 
-@pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("posed", "slider"))])
+@pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slider",))])
 def test_models_of_every_kind(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     case: Case = request.getfixturevalue(name)
     new = case.test[:SHOWN]
