@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case, simulated, simulated_poses
+from recorded_bank import made
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -251,6 +252,6 @@ def test_another_kind_of_measurements_is_refused(arm: Case) -> None:
             dc.recalibrate(arm.model, new)
 
 
-def test_models_of_other_robots_are_not_compared(arm: Case, slider: Case) -> None:
+def test_models_of_other_robots_are_not_compared(arm: Case) -> None:
     with pytest.raises(InputError, match="models of one robot"):
-        dc.compare(arm.model, slider.model)
+        dc.compare(arm.model, made("slides"))
