@@ -140,6 +140,5 @@ def test_so_do_those_of_several_markers_and_of_poses(name: str, kind: str, seed:
     assert found["near_claimed_mm"] < 0.2  # rows like the measured ones are known in any case
 
 
-def test_rows_from_everywhere_show_the_sag_of_all_joints(arm: Case, pair: Case, posed: Case) -> None:
-    for case in (arm, pair, posed):
-        assert case.result.model.map is case.result.fit.model  # with the same deviations
+def test_rows_from_everywhere_show_the_sag_of_all_joints(arm: Case) -> None:
+    assert arm.result.model.map is arm.result.fit.model  # with the same deviations

@@ -11,7 +11,7 @@ from product_bank import ur10_measurements, ur10_scales
 import diffeo_calib as dc
 from diffeo_calib.robots.se3 import twist_transform
 
-ROWS, DRAWS = 120, 2
+ROWS, DRAWS = 80, 2
 """Rows of the model, and numbers of random choices of new ones."""
 
 

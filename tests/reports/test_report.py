@@ -89,7 +89,6 @@ def test_a_registered_and_a_recalibrated_model(arm: Case, tmp_path: Path) -> Non
     new = moved[15 : 15 + SHOWN]
     found = made(tmp_path / "registered.html", registered, new)
     assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(registered, new).rms)
-    made(tmp_path / "registered_alone.html", registered)
     again = dc.recalibrate(arm.model, moved[:20]).model
     found = made(tmp_path / "again.html", again)
     assert found.errors["calibrated"].rms < 3e-4

@@ -56,7 +56,6 @@ def rms(errors: Tensor) -> float:
 
 CASES = {
     "sockets, distances": lambda: [sockets(), read("distance", 36)],
-    "distances, heights, images": lambda: [read("distance", 24), read("height", 24), read("image", 24)],
     "positions, distances from another zero": lambda: [positions(25), read("distance", 36, 0.03)],
     "positions, sockets, images": lambda: [positions(20), sockets(), read("image", 24)],
 }
