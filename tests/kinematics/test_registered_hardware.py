@@ -11,8 +11,8 @@ from product_bank import ur10_measurements, ur10_scales
 import diffeo_calib as dc
 from diffeo_calib.robots.se3 import twist_transform
 
-ROWS, DRAWS = 80, 2
-"""Rows of the model, and numbers of random choices of new ones."""
+ROWS = 120
+"""Of the model."""
 
 
 @pytest.mark.slow
@@ -25,19 +25,13 @@ def test_a_tracker_that_moved_between_two_halves(ur10_folder: Path) -> None:
     T = twist_transform(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.2, 0.4], dtype=torch.float64))
     moved = dc.Measurements(other.q, other.points @ T[:3, :3].mT + T[:3, 3], robot.joint_names)
     for rows, most in ((20, 1.05), (6, 1.25)):
-        losses, inside = [], []
-        for seed in range(DRAWS):
-            order = torch.randperm(len(other), generator=torch.Generator().manual_seed(seed))
-            found = model.registered(moved.rows(order[:rows]))
-            rest = order[rows:]
-            losses.append(dc.evaluate(found, moved.rows(rest)).rms / dc.evaluate(model, other.rows(rest)).rms)
-            mean, covariance = found.predict(moved.q[rest[:40]])
-            away = (mean - moved.points[rest[:40]])[..., None]
-            inside.append((away.mT @ torch.linalg.solve(covariance, away) < 7.815).double().mean())
-        loss = torch.tensor(losses)
-        print(f"{rows} rows: mean {loss.mean():.3f}, median {loss.median():.3f}, worst {loss.max():.3f}")
-        assert float(loss.mean()) < most
-        assert float(torch.stack(inside).mean()) > 0.88
+        order = torch.randperm(len(other), generator=torch.Generator().manual_seed(0))
+        found = model.registered(moved.rows(order[:rows]))
+        rest = order[rows:]
+        assert dc.evaluate(found, moved.rows(rest)).rms < most * dc.evaluate(model, other.rows(rest)).rms
+        mean, covariance = found.predict(moved.q[rest[:40]])
+        away = (mean - moved.points[rest[:40]])[..., None]
+        assert float((away.mT @ torch.linalg.solve(covariance, away) < 7.815).double().mean()) > 0.88
 
 
 @pytest.mark.slow

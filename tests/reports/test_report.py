@@ -110,7 +110,6 @@ def test_markers_on_several_tips_are_named(
     body: tuple[dc.CalibratedKinematics, dc.Measurements], tmp_path: Path
 ) -> None:
     model, new = body
-    made(tmp_path / "own.html", model)
     points = new.points.clone()
     points[7, 1, 2] += 0.01
     found = made(tmp_path / "new.html", model, dc.Measurements(new.q, points, new.joint_names, on=HANDS))
