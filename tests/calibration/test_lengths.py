@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -31,6 +32,11 @@ def warned(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, l
     return result, [str(one.message) for one in caught if "seems to differ" in str(one.message)]
 
 
+@cache
+def clean() -> tuple[dc.CalibrationResult, list[str]]:
+    return warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+
+
 @pytest.mark.parametrize(
     ("factors", "name", "percent"),
     [((1.01,) * 3, "the size of the robot", 1.0), ((1.0, 1.001, 1.0), "the scale of the measuring frame along y", 0.1)],
@@ -46,7 +52,7 @@ def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: 
 
 
 def test_right_scales_are_not_warned_about() -> None:
-    result, texts = warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+    result, texts = clean()
     assert texts == []
     assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
 
@@ -55,11 +61,11 @@ def test_right_scales_are_not_warned_about() -> None:
 def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noticed: bool) -> None:
     """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
     q, y = ARM.measure(ROWS, seed=1)
-    clean = warned(dc.Measurements(q, y))[0].lengths[0]
-    wrong, texts = warned(dc.Measurements(q, y * (1 + share * clean.unnoticed[0] - clean.value)))
+    found = clean()[0].lengths[0]
+    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed[0] - found.value)))
     assert bool(texts) == noticed
-    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * clean.unnoticed[0]
-    assert clean.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed[0]
+    assert found.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
     assert "may be wrong without a warning" in str(wrong.lengths[0])
 
 

@@ -35,7 +35,6 @@ def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Few) -> None:
     q, points = arm.rows.q, arm.rows.points
     for wrong, message in (
         (dc.Measurements(q, 1e3 * points), "do not have the robot's size.*length unit"),
-        (dc.Measurements(q, 1e-3 * points), "do not have the robot's size.*length unit"),
         (dc.Measurements(q.deg2rad(), points), "do not have the robot's size.*angle unit"),
         (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
     ):
@@ -74,10 +73,9 @@ def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Fe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", [(0, 1), (2, 4)])
-def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Few) -> None:
+def test_two_joint_columns_swapped(arm: Few) -> None:
     order = list(range(6))
-    first, second = columns
+    first, second = 2, 4
     order[first], order[second] = second, first
     words = rf"the columns of {arm.robot.joint_names[first]} and {arm.robot.joint_names[second]} seem to be exchanged"
     with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}: check the order of the joints"):
