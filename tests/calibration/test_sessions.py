@@ -97,7 +97,7 @@ def test_rows_of_several_set_ups_are_not_compared_with_a_model(
     for judge in (dc.evaluate, lambda model, rows: dc.write_report(model, tmp_path / "page.html", rows)):
         with pytest.raises(MeasurementError, match=r"session 'a': expected 4 rows, got 'a' in 3 rows"):
             judge(result.model, data)
-    with pytest.raises(MeasurementError, match=r"session 'a': expected 4 rows, got 'a' in 3 rows"):  # of a set-up that is not known
+    with pytest.raises(MeasurementError, match=r"session 'a': expected 4 rows, got 'a' in 3 rows"):  # not known
         dc.evaluate(result.model, data.rows([0, 2, 4]))
 
 
