@@ -38,9 +38,9 @@ def snippets(text: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated arm and tables of its measurements under the names of the documentation."""
+    """A simulated arm and tables of its measurements under the names of the documentation, with fewer rows."""
     place = tmp_path_factory.mktemp("documentation")
-    write_tables(place)
+    write_tables(place, rows=50)
     return place
 
 
