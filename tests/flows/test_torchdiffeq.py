@@ -25,7 +25,9 @@ every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.items(), ids=FI
 every_adaptive = pytest.mark.parametrize("method", ADAPTIVE)
 every_method = pytest.mark.parametrize("method", [*FIXED, *ADAPTIVE])
 SOME_METHODS = [(CASES[0], "midpoint"), (CASES[0], "dopri5"), (CASES[1], "rk4"), (CASES[1], "dopri8")]
-some_methods = pytest.mark.parametrize(("case", "method"), SOME_METHODS, ids=lambda value: getattr(value, "name", value))
+some_methods = pytest.mark.parametrize(
+    ("case", "method"), SOME_METHODS, ids=lambda value: getattr(value, "name", value)
+)
 """Methods see no kernels: of every case a fixed and an adaptive method."""
 
 
