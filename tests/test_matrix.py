@@ -323,11 +323,15 @@ def _(bench: Bench) -> None:
         return kind.registered
 
     numbered_anew = ("two cameras", "two cameras on the tool")  # in the order in which a table's rows show them
-    if kind.name not in (*THROUGHOUT, *numbered_anew):
+    shared = kind.name not in (*THROUGHOUT, *numbered_anew)
+    if shared:
         bench.command.monkeypatch.setattr(dc.CalibratedKinematics, "registered", registered)
     bench.run("evaluate", kind.file, table, *options, "--register", "-o", path)
     model: Any = dc.load(path)
     check_accuracy(kind, model, NEW_ROWS_FACTOR)
+    if shared:  # what is written is what was found
+        one, other = (found.map.deformation(kind.q(5)) for found in (model, kind.registered))
+        assert_close(one, other, rtol=0, atol=1e-12)
 
 
 # --- queries --------------------------------------------------------------------------------------------------------
