@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from diffeo_calib.kernels.spaces import Space
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-    from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
+    from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit
+    from diffeo_calib.kinematics.joint_ranges import joints_outside_range
     from diffeo_calib.measurements.csv.files import read_measurements, read_readings
     from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
@@ -138,7 +139,8 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "kernels.spaces": "Space",
             "kinematics.calibrated": "CalibratedKinematics",
             "kinematics.compensation.compensate": "Compensation compensate",
-            "kinematics.evaluation": "evaluate joints_outside_range rows_used_in_fit",
+            "kinematics.evaluation": "evaluate rows_used_in_fit",
+            "kinematics.joint_ranges": "joints_outside_range",
             "measurements.csv.files": "read_measurements read_readings",
             "measurements.observations": "Observations",
             "measurements.readings": "Readings",

@@ -116,6 +116,16 @@ class Bench:
             assert f"{title} in {unit}" in text or len(printed) >= min(2, len(each)), (kind, text)
         return found
 
+    def share_places(self, module: str) -> None:
+        """Find the places of ``moved`` once for all verbs that begin with them."""
+
+        def place_again(model: dc.CalibratedKinematics, new: Any, marker: str = "evidence") -> Any:
+            assert (model.map, new, marker) == (self.kind.model.map, self.kind.moved, "evidence")
+            return self.kind.placed_again
+
+        path = f"diffeo_calib.calibration.recalibration.{module}.place_again"
+        self.command.monkeypatch.setattr(path, place_again)
+
     def joints(self, count: int = 4) -> Path:
         """A table of joint values in deg."""
         path, names = self.folder / "joints.csv", self.kind.robot.joint_names
@@ -132,7 +142,7 @@ def results(path: Path) -> dict[str, Any]:
 
 
 THROUGHOUT = ("positions", "several kinds")
-"""Kinds that every verb calibrates for itself. The rows of the others are compared with those of a calibration."""
+"""Kinds that every verb calibrates and registers for itself. The rows of the others are compared with those of one."""
 NUMBERED = ("line_numbers", "device", "session", "socket")
 FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")
 """Columns that follow from the corners of all images of a table."""
@@ -296,7 +306,7 @@ def _(bench: Bench) -> None:
 @verb("registered")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    found = kind.model.registered(kind.moved)
+    found = kind.registered
     check_accuracy(kind, found, NEW_ROWS_FACTOR)
     for one in evaluations(dc.evaluate(found, kind.moved)):
         assert one.rms < math.inf
@@ -306,9 +316,22 @@ def _(bench: Bench) -> None:
 def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "moved.safetensors"
     table, options = kind.table("moved")
+
+    def registered(model: dc.CalibratedKinematics, rows: Any, *, free: str) -> dc.CalibratedKinematics:
+        assert (free, model.markers) == ("both", kind.model.markers)
+        check_same_rows(rows, kind.moved)
+        return kind.registered
+
+    numbered_anew = ("two cameras", "two cameras on the tool")  # in the order in which a table's rows show them
+    shared = kind.name not in (*THROUGHOUT, *numbered_anew)
+    if shared:
+        bench.command.monkeypatch.setattr(dc.CalibratedKinematics, "registered", registered)
     bench.run("evaluate", kind.file, table, *options, "--register", "-o", path)
     model: Any = dc.load(path)
     check_accuracy(kind, model, NEW_ROWS_FACTOR)
+    if shared:  # what is written is what was found
+        one, other = (found.map.deformation(kind.q(5)) for found in (model, kind.registered))
+        assert_close(one, other, rtol=0, atol=1e-12)
 
 
 # --- queries --------------------------------------------------------------------------------------------------------
@@ -374,6 +397,7 @@ def _(bench: Bench) -> None:
 @verb("compare with a table")
 def _(bench: Bench) -> None:
     kind = bench.kind
+    bench.share_places("compare")
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
     bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.compare.compare", lambda *_, **__: found)
@@ -394,6 +418,7 @@ def _(bench: Bench) -> None:
     tool = torch.eye(4, dtype=torch.float64)
     tool[2, 3] = 0.1
     one_tip = kind.name != "several tips"
+    bench.share_places("recalibrate")
     found = dc.recalibrate(kind.model.with_tool(tool) if one_tip else kind.model, kind.moved)
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)

@@ -26,9 +26,14 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
     check_not_nominal,
-    warn_of_outliers,
 )
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
+from diffeo_calib.calibration.diagnostics.stuck_columns import (
+    naming_stuck,
+    refuse_stuck,
+    stuck_columns,
+    warn_of_outliers,
+)
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.judgement import warn_of_contradictions
@@ -158,7 +163,8 @@ def calibrate(
     check_controls(controls, measurements)
     check_joints(robot, measurements)
     with kept_warnings() as warned:
-        placed = place(robot, measurements, progress)
+        with naming_stuck(stuck_columns(measurements)):
+            placed = place(robot, measurements, progress)
         check_limits(robot, measurements)
         data = placed.tangent_data()
         check_not_nominal(robot, data, placed.registration, placed.identification)
@@ -247,7 +253,9 @@ def _result(
         devices.warn_of_weakness(model)
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
-    warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
+    wrong, stuck = list({one.row for one in found}), stuck_columns(placed.data)
+    refuse_stuck(chosen.data, stuck, wrong)
+    warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck)
     changed = placed.mislabelled(model, found) or _change(placed, chosen)
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)

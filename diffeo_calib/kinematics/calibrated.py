@@ -15,6 +15,7 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usa
 from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
+from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
@@ -41,7 +42,6 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link
 from diffeo_calib.sensors.places import PlacedDevices
 
 
@@ -203,9 +203,8 @@ class CalibratedKinematics:
                 read a ball or frame that the rows' markers replace, which the model then no longer knows.
         """
         rows = registration_rows(measurements, self)
-        check_payload_link(self.nominal.load.link, measurements)
+        check_same_robot(self, measurements)
         if rows is None:
-            check_joint_order(self.robot, measurements)
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
         ball = self.ball and bool(rows.points[:, -1].isnan().all())

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
@@ -44,6 +46,8 @@ from diffeo_calib.sensors.tables import Coordinates
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
 NUMBERS_OF_A_SOCKET = 3
+REMAINING_SPREAD, SMALLEST_MOTION_M = 0.2, 1e-9
+"""Largest part of the spread within sockets, relative to the tip's motion, that remains where a mistake is undone."""
 LARGEST_MEDIAN_M = 5e-3
 """Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
 
@@ -79,6 +83,13 @@ class Sensor(ABC):
     @abstractmethod
     def check(self, data: Any, model: Any) -> None:
         """Raise InputError or MeasurementError for rows that a model cannot be compared with."""
+
+    def rare(self, data: Any) -> list[str]:
+        """Names of places with too few rows to say anything, in words."""
+        return []
+
+    def check_angles(self, data: Any, model: Any) -> None:  # noqa: B027
+        """Raise MeasurementError for rows that fit a model far better with joint values in another unit of angles."""
 
     @abstractmethod
     def with_points(self, data: Any, model: Any) -> Any:
@@ -220,6 +231,30 @@ class Contacts(Sensor):
         check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
         check_tips(data, model.on[-data.markers :])
 
+    def rare(self, data: Measurements) -> list[str]:
+        """Sockets with one row."""
+        return rare_names(data.row_sockets, data.line_numbers.tolist(), 2)
+
+    def check_angles(self, data: Measurements, model: Any) -> None:
+        """By the spread within sockets, relative to the motion of the tip, with which it shrinks."""
+        if not model.ball:
+            return
+        turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=data.q.device)
+
+        def share(q: Tensor) -> float:
+            tips = model.robot.tip_poses(q)[..., 0, :3, 3]
+            motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
+            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data)).away.norm(dim=1)
+            return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
+
+        own = share(data.q)
+        for factor, words in ANGLE_MISTAKES:
+            other = share(torch.where(turning, factor * data.q, data.q))
+            if other < REMAINING_SPREAD * own:
+                expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
+                fix = angle_mistake(words)
+                raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
+
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With hidden markers before the ball."""
         self.check(data, model)
@@ -227,10 +262,11 @@ class Contacts(Sensor):
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
-        count, lone = len(set(data.row_sockets) - {""}), int(alone(sockets_of(data)[0]).sum())
+        count, lone = len(set(data.row_sockets) - {""}), self.rare(data)
         found = [f"the middles of {count} sockets were found from these rows"]
         if lone:
-            found.append(f"{lone} of {len(data)} rows show no error: they are alone in their socket, so its middle")
+            what = f"{len(lone)} of {len(data)} rows show no error: they are alone in their socket, so its middle"
+            found.append(f"{what}: {few(lone)}")
         return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:

@@ -20,6 +20,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 
 SMALLEST_M = 1e-12
@@ -327,13 +328,10 @@ class ReadPoints(Observation):
 
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed."""
-    counts = torch.bincount(data.device, minlength=len(data.names)).tolist()
-    short = [f"'{name}' {n}" for name, n in zip(data.names, counts, strict=True) if n < FEWEST_PER_DEVICE]
+    short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
     if short:
-        fix, expected = (
-            "measure more rows of them, or leave them out",
-            f"at least {FEWEST_PER_DEVICE} rows of each device",
-        )
+        fix = "check the names in these rows, measure more rows of them, or leave them out"
+        expected = f"at least {FEWEST_PER_DEVICE} rows of each device"
         raise MeasurementError.of("`readings`", expected=expected, got=few(short), fix=fix)
 
 

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.pose_frames import frames_of_points
 from diffeo_calib.measurements.poses import poses_from_marks, poses_of_triangles
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
@@ -337,6 +338,7 @@ def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
         rows = data.session == number
         own[rows] = place
         if int(rows.sum()) < FEWEST_ROWS:
-            fix, got = "measure more rows in it, or leave it out", int(rows.sum())
+            fix = "check the name in these rows, measure more rows in it, or leave it out"
+            got = few(rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_ROWS))
             raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
     return names, own

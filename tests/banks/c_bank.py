@@ -38,7 +38,7 @@ class CModel:
     def __init__(self, source: Path, joints: int, markers: int, prefix: str | None = None) -> None:
         library = source.with_suffix(".so")
         # Users' -O2, which test_c_files.py compiles with, takes longer and gives the same numbers.
-        compiled([COMPILER, "-std=c99", "-O1", *WARNINGS, "-fPIC", "-shared", "-o", library, source, "-lm"])
+        compiled([COMPILER, "-std=c99", "-O0", *WARNINGS, "-fPIC", "-shared", "-o", library, source, "-lm"])
         self.path, self.n, self.markers, self.prefix = library, joints, markers, prefix or source.stem
         self.library = ctypes.CDLL(str(library))
 

@@ -28,6 +28,8 @@ FORMAT = TableFormat("mm", "deg", ";", ",")
 """That of TABLE."""
 STAGES = ("nominal", "geometric", "calibrated")
 
+FEW_CONFIGURATIONS = 100
+
 UNDRAWN = Picture(f'<svg viewBox="0 0 1 1">{4 * "<path/>"}</svg>', "undrawn")
 """In place of the pictures of a page."""
 
@@ -36,7 +38,12 @@ Edit = Callable[[list[list[str]]], object]
 
 
 def leave_undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages keep their sections, numbers and labels; their pictures, which take most of the time, are empty."""
+    """Pages keep their sections, numbers and labels; their pictures, which take most of the time, are empty.
+
+    What the model expects is averaged over fewer configurations.
+    """
+    for name in ("stages", "kinds"):
+        monkeypatch.setattr(f"diffeo_calib.reports.analysis.{name}.CONFIGURATIONS", FEW_CONFIGURATIONS)
     path = "diffeo_calib.reports.html.sections.panel"
     monkeypatch.setattr(path, lambda _, label, *__, **___: replace(UNDRAWN, label=label))
 

@@ -23,9 +23,9 @@ COMMAND = re.compile(r"^    (diffeo-calib (?:.*\\\n)*.*)\n(?:\n```text\n((?:(?!`
 CUT = "..."
 
 
-def write_tables(place: Path) -> None:
-    """A simulated arm, and tables of its measurements."""
-    arm, train, test = simulated(100)
+def write_tables(place: Path, rows: int = 100) -> None:
+    """A simulated arm, and tables of its measurements, of this many rows for the fit."""
+    arm, train, test = simulated(rows)
     arm.write_urdf(place / "robot.urdf")
     names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
     later = test.q.clone()

@@ -27,6 +27,7 @@ from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import LEVER, mark_points
@@ -244,6 +245,16 @@ class Kind:
     def moved(self) -> Any:
         """The new rows of a device that measures coordinates and stands elsewhere; devices of readings stay."""
         return _seen_from(self.new, twist_transform(ELSEWHERE))
+
+    @cached_property
+    def registered(self) -> dc.CalibratedKinematics:
+        """The model, its device found anew with ``moved``."""
+        return self.model.registered(self.moved)
+
+    @cached_property
+    def placed_again(self) -> Before:
+        """Where a comparison and a recalibration with ``moved`` begin."""
+        return place_again(self.model, self.moved)
 
     @cached_property
     def result(self) -> Any:

@@ -282,7 +282,10 @@ def inverse_of(flow: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
     """The points x with flow(x) = y, by Newton's method with autograd Jacobians: (M, n) -> (M, n)."""
     x = 2 * y - flow(y)
     for _ in range(8):
-        x = x + torch.linalg.solve(rows_jacobian(flow, x), y - flow(x))
+        step = torch.linalg.solve(rows_jacobian(flow, x), y - flow(x))
+        x = x + step
+        if float(step.abs().max()) < 1e-14:
+            break
     return x
 
 

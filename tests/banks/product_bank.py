@@ -77,6 +77,30 @@ def usual_scales(robot: dc.Tree) -> dc.Hyperparameters:
     )
 
 
+def ur10_scales() -> dc.Hyperparameters:
+    """Scales such as the search finds for the measured UR10; tests/calibration/test_hardware.py searches them."""
+
+    def each(*values: float) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    return dc.Hyperparameters(
+        transmission_lengthscale=each(0.08, 0.07, 0.06, 0.1, 0.05, 0.2),
+        transmission_amplitude=each(4e-4, 4e-4, 3e-4, 5e-4, 5e-4, 6e-4),
+        coupled_lengthscale=each(2.0, 1.2, 1.5, 1.0, 2.0, 1.3),
+        coupled_amplitude=each(3e-5, 7e-5, 2e-4, 2e-4, 1e-4, 6e-4),
+        joint_noise=each(2e-5, 6e-5, 5e-5, 1e-4, 3e-5, 3e-4),
+        task_lengthscale=each(0.8)[0],
+        task_amplitude=each(1.5e-5)[0],
+        sensor_noise=each(2e-5)[0],
+        rotation_noise=each(7e-5)[0],
+        translation_errors=each(4e-4)[0],
+        rotation_errors=each(6e-4)[0],
+        compliance=each(7e-5, 1.5e-4, 1.7e-4, 7e-4, 1.3e-3, 1.3e-3),
+        lateral_compliance=each(2e-5, 3e-5, 3e-5, 1e-4, 3e-4, 4e-4),
+        gravity=each(0.2, 0.2, 2.9),
+    )
+
+
 def with_usual_scales(robot: dc.Tree, *data: Any, **options: Any) -> Any:
     """:func:`calibrate` with :func:`usual_scales`."""
     return dc.calibrate(robot, *data, **options, hyperparameters=usual_scales(robot))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from functools import cache
 from math import inf
 from types import SimpleNamespace
 from typing import Any, cast
@@ -72,10 +73,19 @@ def with_offset(data: dc.Measurements, joint: int, size: float = OFFSET) -> dc.M
     return dc.Measurements(q, data.points, data.joint_names)
 
 
-def hidden_in(rows: dc.Measurements) -> tuple[HiddenOffset, ...]:
+def compared_with(rows: dc.Measurements) -> Comparison:
     compared = dc.compare(model(positions), rows)
     assert isinstance(compared, Comparison)
-    return compared.hidden
+    return compared
+
+
+@cache
+def unchanged() -> Comparison:
+    return compared_with(positions(arm(), 24, seed=5))
+
+
+def hidden_in(rows: dc.Measurements) -> tuple[HiddenOffset, ...]:
+    return compared_with(rows).hidden
 
 
 @pytest.mark.parametrize(("joint", "what"), [(0, "device"), (5, "markers")])
@@ -89,19 +99,16 @@ def test_offsets_that_places_hide_are_named(joint: int, what: str) -> None:
 
 
 def test_nothing_is_hidden_where_nothing_moved() -> None:
-    assert hidden_in(positions(arm(), 24, seed=5)) == ()
+    assert unchanged().hidden == ()
 
 
 def test_the_smallest_offset_that_rows_show() -> None:
     rows = positions(arm(), 24, seed=5)
-    unchanged = dc.compare(model(positions), rows)
-    assert isinstance(unchanged, Comparison)
-    waist, _, elbow, *_ = unchanged.changes.smallest
+    waist, _, elbow, *_ = unchanged().changes.smallest
     assert waist.size == inf  # the device's place hides it
     assert 2e-5 < elbow.size < 3e-4
     for factor in (0.2, 1.5):
-        found = dc.compare(model(positions), with_offset(rows, 2, factor * elbow.size))
-        assert isinstance(found, Comparison)
+        found = compared_with(with_offset(rows, 2, factor * elbow.size))
         assert [one.part for one in found.changes.found] == [f"the offset of {elbow.joint}"] * (factor > 1)
 
 

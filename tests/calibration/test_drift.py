@@ -177,10 +177,10 @@ def test_columns_that_cannot_be() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
+@pytest.mark.usefixtures("given_scales", "undrawn")
 def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
     form = TableFormat("mm", "deg", time="hour")
-    write_measurements(tmp_path / "t.csv", drifting_rows(), form)
+    write_measurements(tmp_path / "t.csv", drifting_rows()[:ROWS], form)
     ARM.write_urdf(tmp_path / "arm.urdf")
     robot = "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"
     columns = "--length", "mm", "--angle", "deg", "--position", "x,y,z", "--time", "hour"

@@ -106,7 +106,7 @@ def test_the_arm_has_its_lines() -> None:
 @pytest.mark.slow
 def test_a_calibration_reports_its_lines_and_predicts_better() -> None:
     arm = SimulatedArm(3, lines=[(1, 100.0, 1e-4), (0, 200.0, 8e-5)])
-    result = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(150, seed=2)))
+    result = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(120, seed=2)))
     assert sorted(round(line.frequency) for line in result.gear_lines) == [100, 200]
     assert {line.multiple for line in result.gear_lines} == {1, 2}
     names = arm.nominal.joint_names

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_bank import FORMAT, TABLE, Command
+from command_bank import FORMAT, TABLE, Command, leave_undrawn
 from product_bank import usual_scales
 from torch import Tensor
 from torch.testing import assert_close
@@ -104,7 +104,9 @@ def test_errors_are_those_of_what_was_seen(some: dc.Measurements, result: dc.Cal
     assert f"({len(seen)} distances" in repr(found)
 
 
-def test_model_file_knows_what_was_hidden(some: dc.Measurements, result: dc.CalibrationResult, tmp_path: Path) -> None:
+def test_model_file_knows_what_was_hidden(
+    some: dc.Measurements, result: dc.CalibrationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dc.save(result.model, tmp_path / "model.safetensors")
     loaded = dc.load(tmp_path / "model.safetensors")
     assert isinstance(loaded, dc.CalibratedKinematics)
@@ -113,8 +115,8 @@ def test_model_file_knows_what_was_hidden(some: dc.Measurements, result: dc.Cali
     predictions = Predictions.of_fit(fit_rows)
     assert bool((predictions.squares.isnan() == ~some.visible).all())
     assert 0.9 < predictions.coverage() <= 1.0
-    report = dc.write_report(loaded, tmp_path / "report.html", hidden(rows(20, 5), 2))
-    del report
+    dc.write_report(loaded, tmp_path / "report.html", hidden(rows(20, 5), 2))
+    leave_undrawn(monkeypatch)
     dc.write_report(loaded, tmp_path / "fit.html")
     for name in ("report.html", "fit.html"):
         text = (tmp_path / name).read_text(encoding="utf-8")
@@ -148,9 +150,6 @@ def test_recalibration_with_gaps_finds_the_worn_joint(result: dc.CalibrationResu
         registered = result.model.registered(new)
     assert dc.evaluate(again.model, test).rms < 0.6 * dc.evaluate(registered, test).rms
     assert bool((FitRows(again.model).points[-20:].isnan() == new.points.isnan()).all())
-    unchanged = dc.compare(result.model, hidden(elsewhere(rows(20, 15)), 3))
-    assert isinstance(unchanged, dc.Comparison)
-    assert not unchanged.changes.found
 
 
 def test_sessions_with_gaps() -> None:
@@ -166,7 +165,7 @@ def test_sessions_with_gaps() -> None:
     assert dc.evaluate(found.model, test).rms < 1e-4
 
 
-@pytest.mark.usefixtures("given_scales")
+@pytest.mark.usefixtures("given_scales", "undrawn")
 def test_command_line(command: Command, tmp_path: Path) -> None:
     robot, table, model = arm(), tmp_path / "table.csv", tmp_path / "model.safetensors"
     robot.write_urdf(tmp_path / "arm.urdf")

@@ -5,14 +5,19 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import pytest
 import torch
+from golden_bank import sockets
 from reading_bank import readings, scales
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.image import Cameras
 
@@ -25,6 +30,11 @@ def warned(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, l
         warnings.simplefilter("always", DiffeoCalibWarning)
         result = dc.calibrate(ARM.nominal, data, hyperparameters=scales())
     return result, [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+
+
+@cache
+def clean() -> tuple[dc.CalibrationResult, list[str]]:
+    return warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
 
 
 @pytest.mark.parametrize(
@@ -42,7 +52,7 @@ def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: 
 
 
 def test_right_scales_are_not_warned_about() -> None:
-    result, texts = warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+    result, texts = clean()
     assert texts == []
     assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
 
@@ -51,12 +61,29 @@ def test_right_scales_are_not_warned_about() -> None:
 def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noticed: bool) -> None:
     """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
     q, y = ARM.measure(ROWS, seed=1)
-    clean = warned(dc.Measurements(q, y))[0].lengths[0]
-    wrong, texts = warned(dc.Measurements(q, y * (1 + share * clean.unnoticed[0] - clean.value)))
+    found = clean()[0].lengths[0]
+    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed[0] - found.value)))
     assert bool(texts) == noticed
-    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * clean.unnoticed[0]
-    assert clean.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed[0]
+    assert found.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
     assert "may be wrong without a warning" in str(wrong.lengths[0])
+
+
+@pytest.mark.parametrize("rows", [48, 60])
+def test_sockets_without_a_known_distance_show_no_size(rows: int) -> None:
+    """Neither another one nor a change: what the ball differs within a socket is no motion."""
+    golden = sockets()
+    table: Any = golden.rows
+    table = table.rows(slice(0, rows))
+    table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        result = dc.calibrate(golden.robot, table, hyperparameters=golden.scales)
+    assert len(caught) == 1
+    assert "no distance between sockets is known" in str(caught[0].message)
+    size = result.lengths[0]
+    assert abs(size.value) < size.deviation
+    assert size.deviation > 0.01
 
 
 def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:

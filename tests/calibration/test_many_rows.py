@@ -106,7 +106,7 @@ def test_weights_of_many_rows_are_those_of_all_blocks_together(data: dc.Measurem
 
 
 def test_parts_of_a_model_over_some_of_its_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = dc.calibrate(ARM.nominal, data[:SAMPLED], hyperparameters=scales(data))
+    result = dc.calibrate(ARM.nominal, data[:SAMPLED], hyperparameters=scales(data[:SAMPLED]))
     monkeypatch.setattr(findings, "MOST_CONFIGURATIONS", SAMPLED // 2)
     for some, every in zip(findings.parts(result.model), result.parts, strict=True):
         assert some.name == every.name

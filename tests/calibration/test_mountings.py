@@ -107,18 +107,6 @@ def test_a_marker_that_a_session_hides() -> None:
 
 
 @pytest.mark.slow
-def test_a_year_later(result: dc.CalibrationResult) -> None:
-    """The device stands elsewhere, and the marker was mounted anew twice more."""
-    T = twist_transform(torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64))
-    rows = remounted(ARM, table(45, 6), SHIFTS)
-    moved = rows.in_frames(T.expand(len(rows), 4, 4)).with_sessions(rows.device_names, remounted=True)
-    found = dc.recalibrate(result.model, moved)
-    assert not found.changes.found
-    for model in (found.model, result.model.registered(moved)):
-        assert dc.evaluate(model, moved).rms < 1e-4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("said", [False, True])
 def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None:
     """Frames are taken for markers, and markers for frames."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, simulated_poses, ur10_measurements
+from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import scales
 from tangent_bank import Setting, built, normal
 from torch import Tensor
@@ -41,10 +41,11 @@ def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int
 
 @pytest.mark.slow
 def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
-    """0.5 mm from one row of 60 on; the error of the calibration is 0.04 mm."""
-    data = arm.train
+    """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
     change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    size, row = found(arm.robot, dc.Measurements(data.q, from_row(data.points, 25, change)), "the measuring device")
+    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
+    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
+    size, row = found(arm.robot, mixed, "the measuring device")
     assert size == pytest.approx(0.5, rel=0.3)
     assert abs(row - 25) <= 1
 
@@ -60,14 +61,6 @@ def test_a_marker_that_was_knocked_is_noticed(arm: Case) -> None:
     size, row = found(arm.robot, dc.Measurements(data.q, points), "a marker")
     assert size == pytest.approx(1.0, rel=0.3)
     assert abs(row - 40) <= 1
-
-
-@pytest.mark.slow
-def test_rows_in_another_order_are_judged_in_the_order_of_their_numbers(arm: Case) -> None:
-    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
-    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
-    assert abs(found(arm.robot, mixed, "the measuring device")[1] - 25) <= 1
 
 
 def test_the_gain_is_that_of_the_definition() -> None:
@@ -114,7 +107,7 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
     points = from_row(data.points[:100], 50, torch.tensor([6e-4, 0.0, 8e-4], dtype=torch.float64))
     moved = dc.Measurements(data.q[:100], points)
     with pytest.warns(DiffeoCalibWarning, match="these rows do not tell which") as caught:
-        dc.calibrate(robot, moved)
+        dc.calibrate(robot, moved, hyperparameters=ur10_scales())
     (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
     assert text.count("moved by about 1 mm") == 2
     assert all(what in text for what in ("the measuring device", "a marker", "near row 50"))
@@ -134,7 +127,7 @@ def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | 
     return next((text for text in texts if "seems to" in text), None)
 
 
-@pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (1, 5e-4), (2, 5e-4), (5, 2e-3)])
+@pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (2, 5e-4), (5, 2e-3)])
 def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) -> None:
     """From row 30 of 80 on; of the first and the last joint another cause explains as much."""
     arm = SimulatedArm(3)

@@ -115,7 +115,7 @@ def worst(model: dc.CalibratedKinematics, data: dc.Measurements) -> Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tool never turned", "one joint moves", "last joint locked"])
+@pytest.mark.parametrize("name", ["tool never turned", "one joint moves"])
 def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) -> None:
     arm, data = campaign(name, "1 marker", 15)
     far = measured(arm, "1 marker", joints(arm, 60, torch.Generator().manual_seed(9)), torch.Generator())
@@ -130,7 +130,6 @@ def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) 
     ("name", "kind", "seed"),
     [
         ("tool never turned", "poses", 0),
-        ("tool turned about the vertical", "3 markers", 0),
         ("two clusters", "poses", 1),
     ],
 )
@@ -141,6 +140,5 @@ def test_so_do_those_of_several_markers_and_of_poses(name: str, kind: str, seed:
     assert found["near_claimed_mm"] < 0.2  # rows like the measured ones are known in any case
 
 
-def test_rows_from_everywhere_show_the_sag_of_all_joints(arm: Case, pair: Case, posed: Case) -> None:
-    for case in (arm, pair, posed):
-        assert case.result.model.map is case.result.fit.model  # with the same deviations
+def test_rows_from_everywhere_show_the_sag_of_all_joints(arm: Case) -> None:
+    assert arm.result.model.map is arm.result.fit.model  # with the same deviations

@@ -206,10 +206,12 @@ def test_an_image_like_the_last_one_elsewhere_is_the_one_there(name: str) -> Non
     data = kind_named(name).data
     placed = place(kind_named(name).robot, data, silent)
     mine = torch.tensor([own == data.camera_names[-1] for own in data.camera_names]).nonzero()[:, 0]
-    rows = mine[placed.sees(data.q[mine])]
+    number = placed.row_like(data.q[mine])
+    assert number == len(data) - 1
+    rows = mine[placed.sees(number, data.q[mine])]
     assert len(rows) > 0.8 * len(mine)
-    last = data.rows(torch.full_like(rows, len(data) - 1))
-    found, own = placed.measured_at(with_joints(last, data.q[rows]), data.q[rows]), data.rows(rows)
+    last = data.rows(torch.full_like(rows, number))
+    found, own = placed.measured_at(number, with_joints(last, data.q[rows]), data.q[rows]), data.rows(rows)
     for column, most in (("points", 0.01), ("pose_shared", 0.01), ("pose_larger", 0.01), ("pose_covariance", 0.3)):
         value, known = getattr(found, column), getattr(own, column)
         assert float((value - known).norm() / known.norm()) < most, column
@@ -218,11 +220,9 @@ def test_an_image_like_the_last_one_elsewhere_is_the_one_there(name: str) -> Non
 
 def test_a_campaign_asks_the_camera_of_a_row() -> None:
     kind, q = kind_named("two cameras"), drawn("two cameras")
-    points, placed = kind.model(q).detach(), kind.result.placed
+    placed = kind.result.placed
+    points = placed.identification.geometry.points(q)
     for one, other in (cameras(kind), cameras(kind)[::-1]):
-        seen = placed.placement.sees(kind.data.camera_names.index(one.name), points)
+        seen = placed.sees(kind.data.camera_names.index(one.name), q)
         assert float((seen == sees(one.camera, one.boards(points.flatten(1)))).double().mean()) > 0.95
         assert float((seen == sees(other.camera, other.boards(points.flatten(1)))).double().mean()) < 0.8
-    assert torch.equal(
-        placed.sees(q), placed.placement.sees(len(kind.data) - 1, placed.identification.geometry.points(q))
-    )

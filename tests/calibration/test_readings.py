@@ -184,7 +184,9 @@ def test_a_tool_that_never_tilts_is_warned_about() -> None:
     arm = SimulatedArm(2, transmission=0.0)
     q = arm.sample(60, 1)
     data = dc.Readings.distances(q, (in_base(arm, q) - POINTS[0]).norm(dim=1))
-    assert "the tool is hardly tilted" not in calibrated(arm, data)[1]
+    said = calibrated(arm, data)[1]
+    assert "the tool is hardly tilted" not in said
+    assert "another zero" not in said
     q[:, 3:] = q[:1, 3:]
     q[:, 1:3] = q[:1, 1:3] + 0.01 * q[:, 1:3]
     data = dc.Readings.distances(q, (in_base(arm, q) - POINTS[0]).norm(dim=1))
@@ -194,11 +196,11 @@ def test_a_tool_that_never_tilts_is_warned_about() -> None:
 @pytest.mark.slow
 def test_readings_in_another_unit_are_refused() -> None:
     arm = SimulatedArm(2)
-    wide, narrow = readings(arm, "height", 60), touched(arm, (-0.008, 0.0, 0.008), 60)
+    wide, narrow = readings(arm, "height", 45), touched(arm, (-0.008, 0.0, 0.008), 45)
     for data, factor, said in (
         (wide, 1e3, "times larger than the robot moves"),
         (narrow, 1e-3, "times smaller than the robot moves"),
-        (readings(arm, "distance", 60), 1e-3, "check the unit of the readings"),
+        (readings(arm, "distance", 51), 1e-3, "check the units of the readings"),
     ):
         with pytest.raises(MeasurementError, match=said):
             identified(arm.nominal, replace(data, values=factor * data.values))
@@ -217,7 +219,6 @@ def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None
 def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
     arm = SimulatedArm(2)
     exact = readings(arm, "distance", 90, noise=2e-5)
-    assert "another zero" not in calibrated(arm, exact)[1]
     assert "another zero: with a free one, +" in calibrated(arm, replace(exact, values=exact.values + 3e-3))[1]
     far = replace(exact, values=exact.values + 0.1)
     with pytest.raises(MeasurementError, match=r"\+99.8 mm at 'device 0'.* times better; check the device's zero"):
@@ -236,7 +237,7 @@ def test_what_is_refused() -> None:
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}
     names = ["rare"] * 4 + ["often"] * 56
-    with pytest.raises(MeasurementError, match="'rare' 4"):
+    with pytest.raises(MeasurementError, match="'rare' in 4 rows"):
         dc.calibrate(arm.nominal, dc.Readings.distances(good.q, good.values, names))
     with pytest.raises(MeasurementError, match="above 0"):
         dc.Readings.distances(good.q, -good.values)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from product_bank import Case, simulated, ur10_measurements
+from product_bank import Case, simulated, ur10_measurements, ur10_scales
 from test_recalibrate import elsewhere, measured, seen_from, within_region
 
 import diffeo_calib as dc
@@ -127,7 +127,7 @@ def test_a_ur10_measured_again(ur10_folder: Path) -> None:
     columns = [f"measurement_{axis}" for axis in "xyz"]
     units = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
     before = dc.read_measurements(ur10_folder / "measurements_grid_900.csv", robot, columns, **units)  # pyright: ignore[reportArgumentType]
-    old = dc.calibrate(robot, before[::8]).model
+    old = dc.calibrate(robot, before[::8], hyperparameters=ur10_scales()).model
     new, test = data.split(30 / len(data), seed=0)
     found = dc.recalibrate(old, new)
     assert dc.evaluate(found.model, test).rms < 0.9 * dc.evaluate(old.registered(new), test).rms

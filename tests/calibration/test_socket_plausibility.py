@@ -42,7 +42,7 @@ def test_clean_rows_pass(arm: SimulatedArm, rows: SocketRows) -> None:
 
 
 def test_too_few_rows(arm: SimulatedArm, rows: SocketRows) -> None:
-    with pytest.raises(MeasurementError, match=r"socket 2/1: expected at least 2 rows in every socket.*, got 1 row"):
+    with pytest.raises(MeasurementError, match=r"at least 2 rows in every socket.*, got '2/1' in 1 row"):
         stages_by_sockets(arm.nominal, table(rows).rows(slice(0, 31)))
     few = table(rows, distances=None, distance_std=None).rows([0, 1, 6, 7, 12, 13])
     with pytest.raises(MeasurementError, match="rows with sockets: expected at least 9, got 6"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from product_bank import Case, calibrated, simulated, ur10_measurements
+from product_bank import Case, calibrated, simulated, ur10_measurements, ur10_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -248,6 +248,6 @@ def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> 
 def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Path) -> None:
     robot, data = ur10_measurements(ur10_folder)
     inside, outside = split_by_first_joint(data)
-    case = Case(robot, inside, outside, dc.calibrate(robot, inside))
+    case = Case(robot, inside, outside, dc.calibrate(robot, inside, hyperparameters=ur10_scales()))
     _, geometry, diffeomorphic = case.held_out()
     assert diffeomorphic < 0.65 * geometry

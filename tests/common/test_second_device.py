@@ -31,14 +31,14 @@ ONCE, TWICE = (dc.GaussNewton(max_iterations=count) for count in (1, 2))
 """Further iterations repeat the same operations, and every one on the second device passes through Python."""
 FITS: dict[str, Callable[[dc.Problem], dc.Fit]] = {
     "Gauss-Newton": lambda problem: dc.fit(problem, TWICE, dc.RK4(2)),
-    "chosen steps": lambda problem: dc.fit(problem, dc.GaussNewton(max_iterations=5)),
+    "chosen steps": lambda problem: dc.fit(problem, ONCE),
     "many stages": lambda problem: dc.fit(problem, ONCE, dc.RK8(1)),
     "adaptive": lambda problem: dc.fit(problem, ONCE, dc.TorchDiffEq("dopri5", rtol=1e-2, atol=1e-3)),
-    "L-BFGS": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=3), dc.RK4(2)),
-    "descent": lambda problem: dc.fit(problem, dc.GradientDescent(1e-6, max_iterations=3), dc.RK4(1)),
-    "conjugate gradients": lambda problem: dc.fit(problem, dc.GaussNewton(linear="cg", max_iterations=2), dc.RK4(2)),
-    "controls": lambda problem: dc.fit(problem, TWICE, controls=6, integrator=dc.RK4(2)),
-    "eulerian": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=3), dc.RK4(1), formulation="eulerian"),
+    "L-BFGS": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=2), dc.RK4(2)),
+    "descent": lambda problem: dc.fit(problem, dc.GradientDescent(1e-6, max_iterations=2), dc.RK4(1)),
+    "conjugate gradients": lambda problem: dc.fit(problem, dc.GaussNewton(linear="cg", max_iterations=1), dc.RK4(1)),
+    "controls": lambda problem: dc.fit(problem, ONCE, controls=6, integrator=dc.RK4(1)),
+    "eulerian": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=2), dc.RK4(1), formulation="eulerian"),
 }
 QUICK = ("Gauss-Newton",)
 

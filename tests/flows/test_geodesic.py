@@ -159,9 +159,13 @@ def test_gradients_pass_through_flow_and_momenta() -> None:
     assert torch.autograd.gradcheck(transported, (a.requires_grad_(), x.requires_grad_()), eps=1e-6, atol=1e-7)
 
 
-@every_case
 @pytest.mark.parametrize(
-    "integrator", [RK4(2), RK8(1), TorchDiffEq("rk4", step_size=0.5)], ids=lambda i: type(i).__name__
+    ("case", "integrator"),
+    [
+        *((case, RK4(2)) for case in CASES),
+        *((case_named("sum"), integrator) for integrator in (RK8(1), TorchDiffEq("rk4", step_size=0.5))),
+    ],
+    ids=lambda value: getattr(value, "name", type(value).__name__),
 )
 def test_jacobians_of_the_controls_are_those_of_passive_points(case: Case, integrator: Integrator) -> None:
     """One run of controls, momenta and Jacobians equals a run of the controls followed by one of passive points."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from product_bank import Case
+from product_bank import Case, with_usual_scales
 from test_compensate import BOUND, commands, inside, intended, misses, near_wrist_singularity, tool_frame
 
 import diffeo_calib as dc
@@ -17,24 +17,24 @@ from diffeo_calib.robots.geometry import Geometry
 pytestmark = pytest.mark.slow
 
 
-def test_thousands_of_targets(arm_200: Case) -> None:
+def test_thousands_of_targets(arm: Case) -> None:
     """Random ones, through singularities, and out of reach: every row ends in the right status."""
-    q = torch.cat([commands(arm_200, 2000), near_wrist_singularity(arm_200, 400), commands(arm_200, 200, seed=1)])
-    targets = intended(arm_200, q)
+    q = torch.cat([commands(arm, 2000), near_wrist_singularity(arm, 400), commands(arm, 200, seed=1)])
+    targets = intended(arm, q)
     targets[2400:, :3, 3] *= 2.5 / targets[2400:, :3, 3].norm(dim=1, keepdim=True)
-    found = dc.compensate(arm_200.model, targets, q, tool=tool_frame())
-    assert inside(arm_200, found)
-    distance, angle = misses(arm_200, found.q, targets)
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert inside(arm, found)
+    distance, angle = misses(arm, found.q, targets)
     assert float(torch.maximum(distance, angle)[found.reached].max()) <= 1e-9
     assert float(torch.maximum(distance, angle)[~found.reached].min()) > 1e-10
     assert set(found.status[2400:]) == {"unreachable"}
     assert set(found.status[2000:2400]) <= {"reached", "singular", "limit"}
     assert int(found.reached[:2000].sum()) > 1500
-    again = dc.compensate(arm_200.model, targets, q, tool=tool_frame(), limits=[[-20.0, 20.0]] * 6)
+    again = dc.compensate(arm.model, targets, q, tool=tool_frame(), limits=[[-20.0, 20.0]] * 6)
     for row, status in enumerate(found.status):
         if status == "limit":
             assert again.status[row] == "reached"
-    J = arm_200.model.tool_jacobian(q, tool_frame())
+    J = arm.model.tool_jacobian(q, tool_frame())
     J[:, 3:] *= 0.3  # m per rad
     s = torch.linalg.svdvals(J)
     weak = s[:, -1] / s[:, 0]
@@ -55,7 +55,7 @@ def seven_joints() -> tuple[dc.Chain, dc.CalibratedKinematics]:
     q = torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (60, 7)))
     points = truth.absorb(theta).points(q + 3e-4 * torch.sin(q + 1))
     noise = 1e-5 * torch.from_numpy(np.random.default_rng(2).standard_normal(tuple(points.shape)))
-    return robot, dc.calibrate(robot, dc.Measurements(q, points + noise)).model
+    return robot, with_usual_scales(robot, dc.Measurements(q, points + noise)).model
 
 
 def test_a_redundant_arm_stays_near_its_start(seven_joints: tuple[dc.Chain, dc.CalibratedKinematics]) -> None:

@@ -14,13 +14,11 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import (
-    OutsideRange,
     implausible,
     impossible,
-    joints_outside_range,
     rows_used_in_fit,
-    warn_outside_range,
 )
+from diffeo_calib.kinematics.joint_ranges import OutsideRange, joints_outside_range, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 
 

@@ -93,10 +93,11 @@ def test_adaptive_steps_are_refused() -> None:
 
 def compiled_agrees(model: dc.CalibratedKinematics | FittedMap) -> None:
     q = queries(model)
-    same(torch.compile(model, fullgraph=True, backend="eager")(q), model(q), 1e-12)
     same(torch.compile(model.jacobian, fullgraph=True, backend="eager")(q), model.jacobian(q))
     live = q.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(torch.compile(model, fullgraph=True, backend="aot_eager")(live).sum(), live)
+    values = torch.compile(model, fullgraph=True, backend="aot_eager")(live)
+    same(values.detach(), model(q), 1e-12)
+    (slope,) = torch.autograd.grad(values.sum(), live)
     same(slope, model.jacobian(q).flatten(1, -2).sum(1))
 
 
@@ -116,18 +117,18 @@ class Wrapped(torch.nn.Module):
 def test_compiled_without_graph_breaks() -> None:
     torch.compiler.reset()
     compiled_agrees(fitted_plain("matern52"))
-    robot = made("mimic slides", markers=3)
+    robot = made("mimic slides")
     q = queries(robot)
     same(torch.compile(robot, fullgraph=True, backend="eager")(q), robot(q), 1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("strict", [False, True])
-def test_exported_for_any_number_of_rows(strict: bool) -> None:
-    model = fitted_plain("matern52") if strict else made("one joint", markers=3)
+def test_exported_for_any_number_of_rows() -> None:
+    """A robot with poses; a strict export is the capture of `torch.compile` and what this one does with it."""
+    model = made("one joint", markers=3)
     q, rows = queries(model), ({0: torch.export.Dim("rows")},)
-    program = torch.export.export(Wrapped(model), (q,), dynamic_shapes=rows, strict=strict).module()
+    program = torch.export.export(Wrapped(model), (q,), dynamic_shapes=rows, strict=False).module()
     for some in (q[:1], q, q.repeat(9, 1)):
         same(program(some), model(some), 1e-12)
 

@@ -150,7 +150,7 @@ def usual(scales: Hyperparameters, limits: LengthLimits) -> Hyperparameters:
 def _directions(data: TangentData, limits: LengthLimits) -> list[Cause]:
     """The whole robot, the axes of its measuring device, and single links."""
     geometry = data.nominal.geometry
-    away = data.points.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
+    away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
 
     def seen(motion: Tensor) -> Tensor:
         motion = motion.flatten(1)[..., None]

@@ -165,7 +165,16 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
         a phrase: the mistake that explains them, if there is one, else what to check.
     """
     good: list[tuple[float, Reading]] = []
-    for group in (_shifted, _mirrored, _other_tips, other_rotations, _other_joints, longer_chains, other_columns):
+    for group in (
+        _other_lengths,
+        _shifted,
+        _mirrored,
+        _other_tips,
+        other_rotations,
+        _other_joints,
+        longer_chains,
+        other_columns,
+    ):
         for reading in group(robot, data):
             residual = _residual(reading)
             if residual < LIMITS.remaining * typical:
@@ -219,6 +228,15 @@ def _residual(reading: Reading) -> float:
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
 
 
+def _other_lengths(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Positions in another unit; the points of a pose stay where they are beside its origin."""
+    bodies = data.points.unflatten(1, (data.origins.shape[1], -1))
+    for factor, words in ((1e3, "small"), (1e-3, "large")):
+        points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)
+        said = f"the positions seem to be 1000 times too {words}: check their unit (`length`, mm or m)"
+        yield Reading(robot, data.q, points, said, on=data.on or ())
+
+
 def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points that belong to the row before or after."""
     pair = "pair every configuration with its own"
@@ -244,14 +262,21 @@ def _other_tips(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values with one mistake undone."""
-    for q, words in _corrections_of_joints(robot, data):
+    for q, words in corrections_of_joints(robot, data):
         yield Reading(robot, q, data.points, words, on=data.on or ())
 
 
-def _corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
+def corrections_of_angles(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]]:
+    """Joint values (N, n) in another unit of angles, with the mistake that it undoes."""
+    turning = torch.tensor(robot.periodic, dtype=torch.bool, device=q.device)
+    for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
+        yield torch.where(turning, factor * q, q), angle_mistake(words)
+
+
+def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
+    """Joint values (N, n) with one mistake undone, and the mistake."""
     names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
-    for factor, words in ANGLE_MISTAKES:
-        yield torch.where(turning, factor * data.q, data.q), angle_mistake(words)
+    yield from corrections_of_angles(robot, data.q)
     for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
         q = torch.where(turning, data.q, factor * data.q)
         yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"

@@ -355,7 +355,8 @@ def causes_of(data: TangentData) -> list[Cause]:
         base[kinds > 0] = 0.0  # a ball in a socket does not show where the device of other rows stands
     found = [] if data.held else [Cause(BASE, base), Cause(BASE, base[..., :3])]
     found.append(Cause(MARKERS, markers))
-    away = (points - points.mean((0, 1))).flatten(1)[..., None]
+    places = data.places.unflatten(1, (-1, 3))
+    away = (places - places.mean((0, 1))).flatten(1)[..., None]
     found.append(Cause(SCALE, away if data.slopes is None else data.slopes @ away, ("ppm", 1e-6)))
     for joint, name in enumerate(geometry.chain.joint_names):
         if joint > 0 or not data.held:  # without a device no row shows an offset of the first joint

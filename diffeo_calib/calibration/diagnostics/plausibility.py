@@ -189,18 +189,6 @@ def check_deviations(data: Measurements, registration: Identification) -> None:
         )
 
 
-def warn_of_outliers(flagged: int, data: Measurements, reason: str) -> None:
-    """Warn if so many rows are outliers that the inliers may be the wrong ones."""
-    if flagged > LIMITS.gross_share * len(data):
-        text = sentence(
-            f"{flagged} of {len(data)} rows are outliers: do not rely on this calibration",
-            expected=f"at most {100 * LIMITS.gross_share:.0f} %",
-            got=f"for the worst row: {reason}",
-            fix="check that rows pair joints with their own points, and that markers keep their numbers",
-        )
-        warn_user(text)
-
-
 def _check_orientations(data: Measurements, identification: Identification) -> None:
     """Refuse poses whose orientations do not belong to the robot: a wrong convention or unit."""
     angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))

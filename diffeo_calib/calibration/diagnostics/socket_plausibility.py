@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import LIMITS as PATH_LIMITS
+from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS as MISTAKES
+from diffeo_calib.calibration.diagnostics.likely_mistakes import corrections_of_angles, corrections_of_joints
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.identification.registration import SocketRegistration, distances, socket_means
+from diffeo_calib.calibration.identification.registration import (
+    SocketRegistration,
+    distances,
+    register_sockets,
+    socket_means,
+    spread,
+)
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -159,30 +169,66 @@ def check_sockets(robot: Tree, data: Measurements) -> None:
     check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
     resting = socket[socket != NO_SOCKET]
     counts = torch.bincount(resting, minlength=len(sockets.names))
-    single = [name for name, n in zip(sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
+    single = rare_names(data.row_sockets, data.line_numbers.tolist(), LIMITS.fewest_in_socket)
     if single:
         expected = f"at least {LIMITS.fewest_in_socket} rows in every socket, better 10 or more"
-        fix = "measure more rows there, with the tool turned and tilted otherwise, or leave it out"
-        raise MeasurementError.of(f"socket {few(single)}", expected=expected, got="1 row", fix=fix)
+        fix = "check the name, measure more rows there, with the tool turned and tilted otherwise, or leave it out"
+        raise MeasurementError.of("rows with sockets", expected=expected, got=few(single), fix=fix)
     needed = len(counts) + LIMITS.surplus
     if len(resting) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
         raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(resting), fix=fix)
 
 
-def check_registration(robot: Tree, data: Measurements, found: SocketRegistration) -> None:
-    """Refuse rows whose ball is in no socket, or that do not determine its place; warn of a tool that never tilted."""
-    _check_tilt(found)
+def check_registration(
+    robot: Tree, data: Measurements, found: SocketRegistration, around: Geometry | None = None
+) -> None:
+    """Refuse rows whose ball is in no socket, or that do not determine its place; warn of a tool that never tilted.
+
+    Args:
+        robot: n joints. data: rows in sockets alone. found: their registration. around: the robot as a device saw it.
+    """
     median = float(found.distances.median())
+    share = median / _motion(robot, data.q)
     if median > LIMITS.reach_share * robot.reach:
+        mistake = _mistake(robot, data, share, corrections_of_joints(robot, data), around)
         raise MeasurementError.of(
             "these rows do not fit the robot: the ball is in no socket",
             expected=f"a spread within sockets well below {1e3 * LIMITS.reach_share * robot.reach:.3g} mm",
             got=f"a median of {1e3 * median:.3g} mm",
-            fix="check the unit and the order of the joints, and that rows carry the names of their own sockets: of "
+            fix=mistake
+            or "check the unit and the order of the joints, and that rows carry the names of their own sockets: of "
             "the place and of the socket in it",
         )
+    mistake = _mistake(robot, data, share, corrections_of_angles(robot, data.q), around)
+    if mistake:
+        expected = f"a spread within sockets well below the {1e3 * _motion(robot, data.q):.3g} mm that the tip moves"
+        got = f"a median of {1e3 * median:.3g} mm"
+        raise MeasurementError.of("these rows do not fit the robot", expected=expected, got=got, fix=mistake)
+    _check_tilt(found)
     _check_distances(data, found)
+
+
+def _motion(robot: Tree, q: Tensor) -> float:
+    """Motion of the tip over configurations (N, n), m."""
+    return max(spread(robot.tip_poses(q)[..., :3, 3]), 1e-9)
+
+
+def _mistake(
+    robot: Tree, data: Measurements, share: float, tried: Iterable[tuple[Tensor, str]], around: Geometry | None
+) -> str:
+    """The mistake in joint values without which the ball is far better in its sockets; empty for none.
+
+    Args:
+        robot, data, around: see :func:`check_registration`. share: median distance of the ball from its socket,
+            relative to the motion of the tip. tried: joint values (N, n) without a mistake, and what it is.
+    """
+    best, words = MISTAKES.remaining * share, ""
+    for q, mistake in tried:
+        found = register_sockets(robot if around is None else around, q, data.socket_numbers)
+        left = float(found.distances.median()) / _motion(robot, q)
+        best, words = (left, mistake) if left < best else (best, words)
+    return words
 
 
 def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification, found: SocketRegistration) -> None:
@@ -193,10 +239,10 @@ def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification
     """
     if len(known(device.points)) < LIMITS.overdetermined * (6 + 3 * device.markers):
         return  # few positions are fitted nearly exactly: their residual does not show the robot's errors
-    typical, spread = float(distances(start.geometry, device).nanmedian()), float(found.distances.median())
-    if spread > max(LIMITS.other_residuals * typical, LIMITS.other_share * robot.reach):
+    typical, own = float(distances(start.geometry, device).nanmedian()), float(found.distances.median())
+    if own > max(LIMITS.other_residuals * typical, LIMITS.other_share * robot.reach):
         what = "the rows in sockets do not fit the robot whose positions were measured"
-        got = f"a median of {1e3 * spread:.3g} mm"
+        got = f"a median of {1e3 * own:.3g} mm"
         expected = f"a spread within sockets below the {1e3 * typical:.3g} mm of these"
         fix = "check that all rows are of one robot, with the same joint columns and units, and name their own sockets"
         warn_user(sentence(what, expected=expected, got=got, fix=fix))

@@ -44,7 +44,7 @@ ROUGH_M = 2e-3
 STARTS_STEPS = 200
 LONGEST_TOOL_M = 1.0
 UNEXPLAINED = "no place of ball and devices explains the readings"
-CHECK = "check the unit of the readings (mm or m), the order of the joints, "
+CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
 LARGEST_SHARE = 0.02
 """Median residual, relative to the robot's reach, of readings that belong to it."""

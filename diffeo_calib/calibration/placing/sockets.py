@@ -386,7 +386,7 @@ def stages_by_sockets(
     start = None if device is None else registered(robot, device)
     resting = data.socket_rows()
     found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
-    check_registration(robot, resting, found)
+    check_registration(robot, resting, found, None if start is None else start.geometry)
     registration = found.identification
     if start is not None:  # all rows with the weight 1
         registration = start.with_ball(registration)

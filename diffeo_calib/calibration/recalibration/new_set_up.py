@@ -18,10 +18,11 @@ from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
+from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
@@ -33,7 +34,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, check_shown
+from diffeo_calib.sensors.coordinates import check_shown, sensor_of
 from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
@@ -43,6 +44,7 @@ from diffeo_calib.sensors.tables import (
     check_markers,
     divided,
     measured_rows,
+    rows_of_one_kind,
     with_markers,
 )
 
@@ -164,9 +166,11 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 
 
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
-    check_joint_order(model.robot, new)
-    check_payload_link(model.nominal.load.link, new)
-    model.robot.joint_values(new.q)
+    check_same_robot(model, new)
+    rare = [name for table, _ in rows_of_one_kind(new) for name in sensor_of(table).rare(table)]
+    if rare:
+        what = f"rows that say nothing, since they are alone in their socket: {few(rare)}"
+        warn_user(sentence(what, fix="check the names, or measure more rows there"))
     model.nominal.load.under(new.payload).checked()
 
 

@@ -81,6 +81,15 @@ class TangentData:
         """(N, 3 P) coordinates of k0, m."""
         return self.nominal(self.x, self.theta)
 
+    @property
+    def places(self) -> Tensor:
+        """(N, 3 P) where the points were measured, m; k0 for those that were not.
+
+        They grow with the size of the robot, where a ball in one socket is in one place. Of k0 the differences within a
+        socket are the negative residuals, which would look like another size.
+        """
+        return self.points if self.observe is not None else torch.where(self.visible, self.y, self.points)
+
     @cached_property
     def slopes(self) -> Tensor | None:
         """(N, r, 3 P) of the observation at k0; None if coordinates were measured."""

@@ -42,8 +42,8 @@ from diffeo_calib.kinematics.evaluation import (
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
-    warn_outside_range,
 )
+from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations

@@ -20,7 +20,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
-from diffeo_calib.kinematics.evaluation import OutsideRange
+from diffeo_calib.kinematics.joint_ranges import OutsideRange
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile

@@ -20,7 +20,7 @@ from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.evaluation import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
 @dataclass(frozen=True)

@@ -360,7 +360,7 @@ def _check(found: Registration) -> None:
 
 
 def warn_about(found: Registration, *, outliers: bool = True, excess: bool = True) -> None:
-    """Warn of outliers, of directions that the rows do not determine, and of errors that remain.
+    """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
 
     Args:
         found: the registration.
@@ -369,6 +369,12 @@ def warn_about(found: Registration, *, outliers: bool = True, excess: bool = Tru
     if found.outliers and outliers:
         what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
+    if found.exchanged:
+        what = (
+            f"markers {few(found.exchanged)}, or axes of a measured frame, seem to be exchanged: each is where another "
+        )
+        what += "one was"
+        warn_user(sentence(what, fix="put their columns in the order of the fit, unless they were mounted so"))
     for text in found.undetermined:
         warn_user(f"{text}.")
     if found.doubtful and excess:

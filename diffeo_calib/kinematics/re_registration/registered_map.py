@@ -54,6 +54,10 @@ LARGE_EXCESS = 3.0
 """Residuals by this factor above the expected ones mean that something else has changed too."""
 
 
+EXCHANGED_SHARE = 0.1
+"""Distance from the old place of another marker, relative to that from its own, from which a marker is that one."""
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Result of a registration, and the rows behind it.
@@ -97,6 +101,18 @@ class Registration:
     excess: float
     same_place: float | None
     undetermined: tuple[str, ...]
+
+    @property
+    def exchanged(self) -> tuple[int, ...]:
+        """Numbers of the markers, or of a frame's points, that are where other ones were."""
+        if self.shift is None or not self.same:
+            return ()
+        old, size = self.markers - self.shift, self.shift.norm(dim=1)
+        away, where = torch.cdist(self.markers, old).min(1)
+        numbers = torch.arange(len(old), device=where.device)
+        moved = (where != numbers) & (away < EXCHANGED_SHARE * size)
+        moved = moved & moved[where]
+        return tuple(numbers[moved].tolist()) if sorted(where[moved].tolist()) == numbers[moved].tolist() else ()
 
     @property
     def rows(self) -> int:

@@ -19,13 +19,13 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
-    SAME_CONFIGURATION,
     check_rows,
     implausible,
     impossible,
     place,
     rows_used_in_fit,
 )
+from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups

@@ -251,6 +251,7 @@ def test_samples_of_few_poses_hold_both_kinds(tangent: TangentData) -> None:
         assert int((tangent.sample(poses, 10_000, seed=0)[0] < TRACKED).sum()) == drawn
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_needs_measured_positions_alone(
     result: dc.CalibrationResult,
     mixture: dc.Measurements,

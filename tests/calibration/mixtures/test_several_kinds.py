@@ -56,7 +56,6 @@ def rms(errors: Tensor) -> float:
 
 CASES = {
     "sockets, distances": lambda: [sockets(), read("distance", 36)],
-    "distances, heights, images": lambda: [read("distance", 24), read("height", 24), read("image", 24)],
     "positions, distances from another zero": lambda: [positions(25), read("distance", 36, 0.03)],
     "positions, sockets, images": lambda: [positions(20), sockets(), read("image", 24)],
 }
@@ -79,7 +78,7 @@ def test_as_accurate_as_expected(name: str) -> None:
 
 @pytest.fixture(scope="module")
 def joint() -> dc.CalibrationResult:
-    return calibrated([positions(25), read("distance", 36), read("height", 24), read("image", 24)])
+    return calibrated([positions(25), read("distance", 36)])
 
 
 @pytest.mark.slow
@@ -99,8 +98,8 @@ def test_devices_are_where_they_are_within_their_deviations(joint: dc.Calibratio
 
 @pytest.mark.slow
 def test_the_order_of_the_rows_does_not_matter() -> None:
-    data = dc.Observations.joined([positions(25), read("height", 24), read("image", 24)])
-    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(1))
+    data = dc.Observations.joined([positions(20), read("distance", 24), read("height", 24)])
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
     order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
     mixed = data.rows(order.tolist())
     assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
@@ -116,8 +115,6 @@ def test_payloads() -> None:
 
     result = calibrated([laden(positions(25)), laden(read("distance", 36))])
     assert rms(ball_errors(result, free=False)) < 2 * result.expected.workspace
-    alone = calibrated([laden(read("distance", 60))])
-    assert rms(ball_errors(alone, free=True)) < 2 * alone.expected.workspace
 
 
 def test_sessions() -> None:
@@ -135,15 +132,14 @@ def test_sessions() -> None:
 
 
 @pytest.mark.slow
-def test_controls() -> None:
+def test_controls(joint: dc.CalibrationResult) -> None:
     """Fewer momenta than rows: the deviations of devices are found as well."""
-    whole = calibrated([positions(25), read("distance", 36)])
     coarse = calibrated([positions(25), read("distance", 36)], controls=40)
-    for one, other in zip(whole.readings, coarse.readings, strict=True):
+    for one, other in zip(joint.readings, coarse.readings, strict=True):
         assert one.known is not None
         assert other.known is not None
         torch.testing.assert_close(other.known, one.known, rtol=0.1, atol=1e-6)
-    assert rms(whole.model(ARM.sample(50, 2)).detach() - coarse.model(ARM.sample(50, 2)).detach()) < 1e-4
+    assert rms(joint.model(ARM.sample(50, 2)).detach() - coarse.model(ARM.sample(50, 2)).detach()) < 1e-4
 
 
 def test_poses_in_a_table_of_several_kinds_are_refused() -> None:

@@ -1,0 +1,148 @@
+"""Joint values of rows beside those of a model's fit: outside their ranges, or in another unit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, LARGEST_JOINT_ANGLE_RAD, angle_mistake
+from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, sensor_of
+from diffeo_calib.sensors.tables import rows_of_one_kind
+
+SAME_CONFIGURATION = 1e-9
+"""Largest difference [rad or m] between the joint values of one row in two files, which comes from rounding."""
+TELLING_ROWS, TELLING_MOTION = 10, 0.25
+"""Rows, and their median range of a joint relative to the fit's, from which they move as those of the fit."""
+RANGE_MARGIN = 0.25
+"""Rows may lie outside the joint range of the fit by this fraction of the range."""
+
+
+def joints_outside_range(model: Any, q: object) -> Tensor:
+    """Which joint values lie outside the range of the joint in the fit by more than a quarter of that range.
+
+    Args:
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
+
+    Returns:
+        (N, n) boolean. ``joints_outside_range(model, q).any(1)`` are the rows whose errors are not known.
+
+    Raises:
+        InputError: not a calibrated model, wrong shape, or values that are not finite.
+    """
+    fitted = fitted_configurations(model)
+    q = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+    low, high = fitted.amin(0), fitted.amax(0)
+    margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
+    return (q < low - margin) | (q > high + margin)
+
+
+def fitted_configurations(model: object) -> Tensor:
+    """(N, n) configurations that a model was fitted to."""
+    found = getattr(model, "configurations", None)
+    if not isinstance(found, Tensor):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    return found
+
+
+class OutsideRange:
+    """Configurations outside the joint ranges of the fit, where the model's errors are not known, over many tables.
+
+    Args:
+        model: the calibrated model.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.rows = self.outside = 0
+        self.joints = torch.zeros(model.robot.n, dtype=torch.bool, device=model.configurations.device)
+        self._turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=model.configurations.device)
+        self._outside_otherwise = [0 for _ in ANGLE_MISTAKES]
+        self._ends = model.configurations.new_empty(0, model.robot.n)
+
+    def add(self, q: object) -> None:
+        """Count configurations (N, n), rad or m."""
+        outside = joints_outside_range(self.model, q)
+        self.rows += len(outside)
+        self.outside += int(outside.any(1).sum())
+        self.joints |= outside.any(0)
+        values = self.model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+        for number, (factor, _) in enumerate(ANGLE_MISTAKES):
+            meant = torch.where(self._turning, factor * values, values)
+            self._outside_otherwise[number] += int(joints_outside_range(self.model, meant).any(1).sum())
+        ends = torch.cat([self._ends, values])
+        self._ends = torch.stack([ends.amin(0), ends.amax(0)]) if len(ends) else ends
+
+    def refuse_other_unit(self) -> None:
+        """Raise MeasurementError for joint values that look like the rows of the fit in the other unit of angles.
+
+        All of them are then within the joint ranges of the fit, and as they are none is, or they hardly move. Degrees
+        are larger than what an axis can turn in radians: smaller values would be in any range around zero.
+        """
+        for outside, (factor, words) in zip(self._outside_otherwise, ANGLE_MISTAKES, strict=True):
+            tells = self.rows > 0 and bool(self._turning.any())
+            tells = tells and outside == 0 and (factor > 1.0 or self._turns_too_far())
+            if tells and (self.outside == self.rows or self._moves_as_in_fit(factor)):
+                expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
+                raise MeasurementError.of("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+
+    def _turns_too_far(self) -> bool:
+        """Whether some axis turns further than axes do."""
+        return float(self._ends[:, self._turning].abs().max()) > LARGEST_JOINT_ANGLE_RAD
+
+    def _moves_as_in_fit(self, factor: float) -> bool:
+        """Whether the turning joints move as in the fit if their values are multiplied by a factor, but hardly else."""
+        fitted = self.model.configurations
+        moved = (self._ends[1] - self._ends[0]) / (fitted.amax(0) - fitted.amin(0)).clamp(min=SAME_CONFIGURATION)
+        return (
+            factor > 1.0
+            and self.rows >= TELLING_ROWS
+            and float(factor * moved[self._turning].median()) > TELLING_MOTION
+        )
+
+    def warn(self) -> None:
+        """Warn (DiffeoCalibWarning) with the number of rows and the names of the joints, if there are any."""
+        if self.outside:
+            names = [name for name, out in zip(self.model.robot.joint_names, self.joints, strict=True) if bool(out)]
+            rows = f"{self.outside} of {self.rows} rows"
+            what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
+            fix = "trust them less than their standard deviations say, or measure there too"
+            warn_user(sentence(what, fix=fix))
+
+
+def warn_outside_range(model: Any, q: object, *, refuse_other_unit: bool = False) -> None:
+    """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
+
+    Args:
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
+        refuse_other_unit: see :meth:`OutsideRange.refuse_other_unit`.
+
+    Warns:
+        DiffeoCalibWarning: with the number of rows and the names of the joints.
+    """
+    found = OutsideRange(model)
+    found.add(q)
+    if refuse_other_unit:
+        found.refuse_other_unit()
+    found.warn()
+
+
+def check_same_robot(model: Any, data: Any) -> None:
+    """Refuse rows of other joints than a model's, in another order or unit of angles, or of a payload elsewhere.
+
+    Args:
+        model: a calibrated model. data: rows of any kinds.
+
+    Raises:
+        InputError: joints in another order. MeasurementError: see :meth:`OutsideRange.refuse_other_unit` and
+            :meth:`Sensor.check_angles`.
+    """
+    check_joint_order(model.robot, data)
+    check_payload_link(model.nominal.load.link, data)
+    found = OutsideRange(model)
+    found.add(data.q)
+    found.refuse_other_unit()
+    for table, _ in rows_of_one_kind(data):
+        sensor_of(table).check_angles(table, model)

@@ -1,0 +1,71 @@
+"""Joint values in the other unit of angles are refused by every verb that compares rows with a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from kind_bank import Kind, kind_named, marked
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.kinematics.joint_ranges import OutsideRange
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import Sockets
+
+VERBS: dict[str, Callable[[Any, Any], Any]] = {
+    "evaluate": dc.evaluate,
+    "registered": lambda model, rows: model.registered(rows),
+    "recalibrate": dc.recalibrate,
+    "compare": dc.compare,
+}
+
+
+def in_other_unit(rows: Any, factor: float) -> Any:
+    if isinstance(rows, dc.Observations):
+        return dc.Observations([in_other_unit(part, factor) for part in rows.parts], rows.index)
+    return with_attributes(rows, q=factor * rows.q)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(("factor", "unit"), [(math.pi / 180, "radians"), (180 / math.pi, "degrees")])
+@pytest.mark.parametrize("name", marked("ball in sockets", "positions", "heights", "several kinds"))
+def test_rows_in_another_unit_of_angles_are_refused(name: str, factor: float, unit: str, verb: str) -> None:
+    kind = kind_named(name)
+    with pytest.raises(MeasurementError, match=f"the joint values seem to be {unit}.*check the angle unit"):
+        VERBS[verb](kind.model, in_other_unit(kind.new, factor))
+
+
+def test_rows_of_another_region_are_not_taken_for_degrees() -> None:
+    """All of them are outside the joint ranges of the fit, and within these if divided by 57."""
+    kind = kind_named("positions")
+    q = kind.new.q.clone()
+    q[:, 1] += 1.3 * (q[:, 1].amax() - q[:, 1].amin())
+    found = OutsideRange(kind.model)
+    found.add(q)
+    assert found.outside == found.rows
+    found.refuse_other_unit()
+
+
+def without_distances(kind: Kind) -> Any:
+    data = kind.data
+    return with_attributes(data, sockets=Sockets(data.sockets.names))
+
+
+MISTAKES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "seem to be radians that were converted": lambda q: q * math.pi / 180,
+    "seem to be degrees": lambda q: q * 180 / math.pi,
+    "columns of shoulder_joint and elbow_joint seem to be exchanged": lambda q: q[:, [0, 2, 1, 3, 4, 5]],
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+@pytest.mark.filterwarnings("ignore:no distance between sockets", "ignore:shoulder_joint. hardly moved")
+def test_rows_in_sockets_with_wrong_joint_values_are_refused(words: str) -> None:
+    kind = kind_named("ball in sockets")
+    data = without_distances(kind)
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(kind.robot, with_attributes(data, q=MISTAKES[words](data.q)), hyperparameters=kind.scales)
