@@ -6,7 +6,6 @@ checks a small claim about what it gives.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import re
@@ -19,7 +18,22 @@ import jsonschema
 import pytest
 import torch
 from command_bank import Command, Outcome, leave_undrawn
-from kind_bank import FREE, KINDS, POSITIONED, QUICK, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
+from kind_bank import (
+    FREE,
+    KINDS,
+    POSITIONED,
+    QUICK,
+    UNITS,
+    WITH_POSES,
+    Kind,
+    check_accuracy,
+    check_same_rows,
+    kind_named,
+    of_payload,
+    rigid_rms,
+    share_places,
+    table_rows,
+)
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -116,16 +130,6 @@ class Bench:
             assert f"{title} in {unit}" in text or len(printed) >= min(2, len(each)), (kind, text)
         return found
 
-    def share_places(self, module: str) -> None:
-        """Find the places of ``moved`` once for all verbs that begin with them."""
-
-        def place_again(model: dc.CalibratedKinematics, new: Any, marker: str = "evidence") -> Any:
-            assert (model.map, new, marker) == (self.kind.model.map, self.kind.moved, "evidence")
-            return self.kind.placed_again
-
-        path = f"diffeo_calib.calibration.recalibration.{module}.place_again"
-        self.command.monkeypatch.setattr(path, place_again)
-
     def joints(self, count: int = 4) -> Path:
         """A table of joint values in deg."""
         path, names = self.folder / "joints.csv", self.kind.robot.joint_names
@@ -143,9 +147,6 @@ def results(path: Path) -> dict[str, Any]:
 
 THROUGHOUT = ("positions", "several kinds")
 """Kinds that every verb calibrates and registers for itself. The rows of the others are compared with those of one."""
-NUMBERED = ("line_numbers", "device", "session", "socket")
-FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")
-"""Columns that follow from the corners of all images of a table."""
 Verb = Callable[[Bench], None]
 VERBS: dict[str, Verb] = {}
 
@@ -167,34 +168,6 @@ def _leaves(entry: Any) -> Iterator[tuple[str, str]]:
     else:
         for own in entry.values():
             yield from _leaves(own)
-
-
-def finite(values: torch.Tensor) -> torch.Tensor:
-    return values[values.isfinite()]
-
-
-def table_rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1.0) -> None:
-    q = kind.q()
-    loaded = model.with_payload(4.0) if kind.name == "payloads" else model
-    assert kind.error_mm(loaded(q), q) < factor * kind.source.worst_mm
-
-
-def check_same_rows(found: Any, rows: Any) -> None:
-    """But for the last digits that a table does not hold."""
-    assert_close(found.q, rows.q, rtol=0, atol=1e-12)
-    assert found.device_names == rows.device_names
-    assert [part.kind for part in found.parts] == [part.kind for part in rows.parts]
-    for one, other in zip(found.parts, rows.parts, strict=True):
-        for name, values in other.columns.items():
-            if name == "corners":  # padding is not written
-                assert_close(finite(one.columns[name]), finite(values), rtol=0, atol=1e-9)
-            elif name not in NUMBERED and not (name in FROM_IMAGES and other.corners is not None):
-                assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
 
 
 def evaluations(found: Any) -> list[Any]:
@@ -397,7 +370,7 @@ def _(bench: Bench) -> None:
 @verb("compare with a table")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    bench.share_places("compare")
+    share_places(kind, "compare", bench.command.monkeypatch)
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
     bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.compare.compare", lambda *_, **__: found)
@@ -418,7 +391,7 @@ def _(bench: Bench) -> None:
     tool = torch.eye(4, dtype=torch.float64)
     tool[2, 3] = 0.1
     one_tip = kind.name != "several tips"
-    bench.share_places("recalibrate")
+    share_places(kind, "recalibrate", bench.command.monkeypatch)
     found = dc.recalibrate(kind.model.with_tool(tool) if one_tip else kind.model, kind.moved)
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)

@@ -6,6 +6,7 @@ The robots and most rows are those of the golden numbers; here a part of the row
 from __future__ import annotations
 
 import copy
+import csv
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from golden_bank import Golden
 from product_bank import simulated_poses
 from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
@@ -401,3 +403,48 @@ def rigid_rms(points: Tensor, truth: Tensor) -> float:
 def of_payload(kind: Kind) -> dc.CalibratedKinematics:
     """The model at the payload of the truth."""
     return kind.model.with_payload(4.0) if kind.name == "payloads" else kind.model
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+
+NUMBERED = ("line_numbers", "device", "session", "socket")
+FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")
+"""Columns that follow from the corners of all images of a table."""
+
+
+def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1.0) -> None:
+    q = kind.q()
+    loaded = model.with_payload(4.0) if kind.name == "payloads" else model
+    assert kind.error_mm(loaded(q), q) < factor * kind.source.worst_mm
+
+
+def finite(values: torch.Tensor) -> torch.Tensor:
+    return values[values.isfinite()]
+
+
+def check_same_rows(found: Any, rows: Any) -> None:
+    """But for the last digits that a table does not hold."""
+    assert_close(found.q, rows.q, rtol=0, atol=1e-12)
+    assert found.device_names == rows.device_names
+    assert [part.kind for part in found.parts] == [part.kind for part in rows.parts]
+    for one, other in zip(found.parts, rows.parts, strict=True):
+        for name, values in other.columns.items():
+            if name == "corners":  # padding is not written
+                assert_close(finite(one.columns[name]), finite(values), rtol=0, atol=1e-9)
+            elif name not in NUMBERED and not (name in FROM_IMAGES and other.corners is not None):
+                assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
+
+
+def share_places(kind: Kind, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Find the places of ``moved`` once for all verbs that begin with them."""
+
+    def place_again(model: dc.CalibratedKinematics, new: Any, marker: str = "evidence") -> Before:
+        assert (model.map, new, marker) == (kind.model.map, kind.moved, "evidence")
+        return kind.placed_again
+
+    monkeypatch.setattr(f"diffeo_calib.calibration.recalibration.{module}.place_again", place_again)
+
+
+def table_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
