@@ -118,7 +118,8 @@ class ImageTable(RowTable):
         names = tuple(dict.fromkeys(name for table in tables for name in table.session_names))
         found = []
         for table in super().of_one_layout(tables):
-            own = torch.tensor([names.index(name) for name in table.session_names] + [-1], device=HOST)
+            numbers = [*(names.index(name) for name in table.session_names), -1]
+            own = torch.tensor(numbers, dtype=torch.int64, device=HOST)
             session = None if table.session is None else own[table.session]
             found.append(table if session is None else with_attributes(table, session=session, session_names=names))
         return found

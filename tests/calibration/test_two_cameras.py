@@ -229,7 +229,7 @@ def test_a_wrong_size_or_lens_names_its_camera() -> None:
 def test_a_camera_of_few_images_is_refused() -> None:
     few = data().rows([name == "left" or k < 7 for k, name in enumerate(data().camera_names)])
     assert Counter(few.camera_names)["right"] == 3
-    with pytest.raises(MeasurementError, match=r"'right'.*expected 4 rows, got 3"):
+    with pytest.raises(MeasurementError, match=r"'right'.*expected 4 rows, got 'right' in 3 rows"):
         dc.calibrate(kind().robot, few)
 
 

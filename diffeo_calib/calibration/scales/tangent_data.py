@@ -83,12 +83,16 @@ class TangentData:
 
     @property
     def places(self) -> Tensor:
-        """(N, 3 P) where the points were measured, m; k0 for those that were not.
+        """(N, 3 P) of k0, m, which grows with the size of the robot, but the sockets where a ball rests in one.
 
-        They grow with the size of the robot, where a ball in one socket is in one place. Of k0 the differences within a
-        socket are the negative residuals, which would look like another size.
+        A socket is one place, with one effect of the size on all of its rows. Of k0 the differences within it are the
+        negative residuals, which would look like another size.
         """
-        return self.points if self.observe is not None else torch.where(self.visible, self.y, self.points)
+        kinds = self.noise_model.row_kinds
+        if self.observe is not None or (kinds is None and not self.held):
+            return self.points
+        resting = self.visible if kinds is None else self.visible & (kinds > 0)[:, None]
+        return torch.where(resting, self.y, self.points)
 
     @cached_property
     def slopes(self) -> Tensor | None:
