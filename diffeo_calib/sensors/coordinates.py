@@ -23,6 +23,7 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
@@ -280,12 +281,15 @@ class Contacts(Sensor):
         """None: a ball in a socket is where the robot brought it."""
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        """The middles of the sockets, with the standard deviations of these."""
+        """The middles of the sockets, with their standard deviations; a single row deviates as those of others do."""
         socket, known = sockets_of(data)
         numbers = socket.unique()
         own = [points[socket == number, -1] for number in numbers]
         middles = torch.stack([rows.mean(0) for rows in own])
-        deviations = torch.stack([rows.std(0, correction=len(rows) > 1) / len(rows) ** 0.5 for rows in own])
+        spreads = [rows.var(0) for rows in own if len(rows) > 1]
+        single = torch.stack(spreads).mean(0).sqrt() if spreads else torch.full_like(middles[0], PLACES.found_m_rad)
+        each = [rows.std(0) / len(rows) ** 0.5 if len(rows) > 1 else single for rows in own]
+        deviations = torch.stack(each)
         names = tuple(known.names[number] for number in numbers.tolist())
         return (PlacedDevices.outside(SOCKET, names, middles, deviations),)
 

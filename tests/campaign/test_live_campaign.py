@@ -15,6 +15,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.campaign.certainty import limit_of
+from diffeo_calib.campaign.model import with_joints
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
@@ -355,3 +356,15 @@ def test_next_poses_of_a_ball_are_in_sockets() -> None:
     none = given.next(5)
     assert none is not None
     assert len(none.q) == 0
+
+
+def test_a_row_elsewhere_is_in_the_socket_there() -> None:
+    kind = kind_named("mixture")
+    data, placed = kind.data, kind.result.placed
+    resting = (data.socket_numbers >= 0).nonzero()[:, 0]
+    row = int(resting[-1])
+    copies = with_joints(data.rows(torch.full_like(resting, row)), data.q[resting])
+    assert set(copies.row_sockets) == {data.row_sockets[row]}
+    found = placed.measured_at(row, copies, data.q[resting])
+    assert found.row_sockets == data.rows(resting).row_sockets
+    assert bool(placed.sees(row, data.q[resting]).all())

@@ -187,8 +187,8 @@ class Placed:
 
     def row_like(self, q: Tensor) -> int:
         """Number of the last row as which some of the configurations q (M, n) can be measured; else the very last."""
-        last = len(self.data) - 1
-        return next((row for row in range(last, -1, -1) if bool(self.sees(row, q).any())), last)
+        last, points = len(self.data) - 1, self.identification.geometry.points(q)
+        return next((row for row in range(last, -1, -1) if bool(self.placement.sees(row, points).any())), last)
 
     def sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations that can be measured as a row was, by a camera that sees its board."""

@@ -52,8 +52,6 @@ from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
 
 LARGE_EXCESS = 3.0
 """Residuals by this factor above the expected ones mean that something else has changed too."""
-
-
 EXCHANGED_SHARE = 0.1
 """Distance from the old place of another marker, relative to that from its own, from which a marker is that one."""
 
