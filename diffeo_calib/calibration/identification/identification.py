@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError

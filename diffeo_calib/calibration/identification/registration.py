@@ -32,7 +32,7 @@ from diffeo_calib.calibration.identification.identification import (
     checked_rows,
     in_mm,
 )
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known, largest_known

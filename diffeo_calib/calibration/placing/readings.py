@@ -27,7 +27,7 @@ from diffeo_calib.calibration.identification.identification import (
     weighed_fits,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

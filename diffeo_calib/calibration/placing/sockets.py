@@ -35,7 +35,7 @@ from diffeo_calib.calibration.identification.registration import (
     socket_means,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median

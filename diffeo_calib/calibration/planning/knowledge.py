@@ -32,7 +32,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, NumericalError, as_written, few
 from diffeo_calib.common.threads import large_work

@@ -38,7 +38,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     warn_of_moved_markers,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user

@@ -27,7 +27,7 @@ from diffeo_calib.calibration.scales.differing_noise import noise_of_new_rows
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import region_factor
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.regression.conditional import diagonal_blocks

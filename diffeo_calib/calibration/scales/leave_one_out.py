@@ -1,6 +1,6 @@
-"""Errors of the tangent model that decide about outliers: weights by heavy tails, and leave-one-out errors.
+"""Errors of the tangent model that decide about outliers: weights of gross errors, and leave-one-out errors.
 
-The weights of Student's t (student_t.py) need the errors of the measurements, not the residuals of the fit, which are
+The weights (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are
 smaller. The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
@@ -12,14 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf, nan
+from math import nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
-from diffeo_calib.calibration.student_t import Tails, region_factor, reweight, weighed
+from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.maps.noise import Noise
@@ -79,7 +80,7 @@ def estimate_tails(
     rounds: int = ROUNDS,
     block_coordinates: int = BLOCK_COORDINATES,
 ) -> Tails:
-    """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
+    """Weights and gross errors for given scales, by expectation maximisation from the weights of the data.
 
     Args:
         data: the measurements. scales: held fixed. seed: draws the blocks.
@@ -102,7 +103,7 @@ def estimate_tails(
 def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
     """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
 
-    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
+    Share and size of gross errors are those with the weights of the data. With these each block finds its own
     weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
     """
     data = data.told
@@ -111,11 +112,11 @@ def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> 
     for rows in blocks:
         squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
     first = reweight(squares, data.noise_model.freedom)
-    for rows in blocks if first.freedom < inf else ():
+    for rows in blocks if first.share > 0.0 else ():
         block, tails = _Block(data.rows(rows), scales), first.rows(rows)
         for _ in range(ROUNDS - 1):
             squares[rows] = block.squares(tails)
-            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
+            before, tails = tails, first.weighed(squares[rows], data.noise_model.freedom)
             if _settled(before, tails):
                 break
     return reweight(squares, data.noise_model.freedom)

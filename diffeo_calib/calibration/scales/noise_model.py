@@ -29,7 +29,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden

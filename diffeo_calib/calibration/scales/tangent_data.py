@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters, SeparateKernels, SumOfKernels
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
