@@ -45,7 +45,7 @@ from robot_data import data_folder
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import COUPLED_PROFILE
+from diffeo_calib.process.scales import COUPLED_PROFILE
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -38,7 +38,7 @@ from diffeo_calib.calibration import choose_scales
 from diffeo_calib.calibration.diagnostics.plausibility import registered
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
+from diffeo_calib.process.scales import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults, select

@@ -26,7 +26,6 @@ from diffeo_calib.calibration.scales.cross_validation import cross_validated_inf
 from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     estimate_tails,
@@ -42,6 +41,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import SMALLER, reweight
 
 
@@ -298,9 +298,9 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     sag = data.nominal.elasticity
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
-    some = data.sample(POSES, COORDINATES, seed)[1].told
+    some = data.sample(POSES, COORDINATES, seed)[1]
     tried = [replace(scales, payload=factor) for factor in FACTORS]
-    return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))
+    return max(tried, key=lambda one: some.process(one).evidence)
 
 
 RESIDUAL_TOLERANCE = 1e-5

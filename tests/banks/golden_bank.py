@@ -25,7 +25,7 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import GearLine
+from diffeo_calib.process.scales import GearLine
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation

@@ -11,7 +11,7 @@ from product_bank import Case, calibrated, simulated, usual_scales
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import SCALES
+from diffeo_calib.process.scales import SCALES
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.radial import RadialKernel

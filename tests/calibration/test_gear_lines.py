@@ -11,7 +11,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData

@@ -10,7 +10,7 @@ from tangent_bank import Setting, shaken
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
+from diffeo_calib.process.scales import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 from diffeo_calib.kinematics.nominal import GeometryMap
 
 

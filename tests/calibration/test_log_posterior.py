@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, SCALES
+from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, ScalePrior, log_likelihood, log_posterior
 from diffeo_calib.robots import SimulatedArm
 

@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.readings import FoundReadings, identify_readings
-from diffeo_calib.calibration.scales.hyperparameters import SCALES
+from diffeo_calib.process.scales import SCALES
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData

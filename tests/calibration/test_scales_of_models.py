@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import DEVIATIONS, SCALES
+from diffeo_calib.process.scales import DEVIATIONS, SCALES
 from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

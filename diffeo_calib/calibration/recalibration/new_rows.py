@@ -23,7 +23,6 @@ from diffeo_calib.calibration.placing.readings import ReadingDevices
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
@@ -31,6 +30,7 @@ from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_no
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds

@@ -17,13 +17,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.regression.regions import CONFIDENCE
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.regions import CONFIDENCE
 
 HALVINGS = 50
 """Of the interval in which the quantile lies: to the last digit."""
