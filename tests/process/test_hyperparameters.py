@@ -10,8 +10,8 @@ from tangent_bank import Setting, shaken
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.process.scales import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.process.scales import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 
 
 def test_logarithms_round_trip(setting: Setting) -> None:
