@@ -44,13 +44,10 @@ class Covariance:
         by_point = torch.cat([_times_points(task[:, part.points], part.A) for part in self.b.parts], 2)  # (Ta, 3, Mb)
         total = by_joint.new_empty(len(self.a.target), len(self.b.target))
         for part in self.a.parts:
-            space = by_point[part.points].reshape(len(part.J), -1, by_point.shape[2])  # (N, P 3, Mb)
-            torch.baddbmm(
-                part.A.flatten(2) @ space,
-                part.J,
-                by_joint[part.rows],
-                out=total[part.numbers].view(*part.cells.shape, -1),
-            )
+            N, _, P, _ = part.A.shape
+            space = by_point[part.points].reshape(N, 3 * P, total.shape[1])
+            own = torch.baddbmm(part.A.flatten(2) @ space, part.J, by_joint[part.rows])
+            total[part.numbers] = own.flatten(0, 1)
         return total
 
     def inner(self, values: Values, weights: Tensor) -> Tensor:
@@ -73,8 +70,11 @@ def joint_weights(a: Numbers, b: Numbers, weights: Tensor) -> Tensor:
     rows = []
     for part in a.parts:
         half = part.J.mT @ weights[part.numbers].view(*part.cells.shape, -1)
-        own = [half[..., other.numbers].unflatten(2, other.cells.shape) for other in b.parts]
-        rows.append(torch.cat([torch.einsum("icjr,jrc->icj", one, other.J) for one, other in zip(own, b.parts)], 2))
+        own = [
+            torch.einsum("icjr,jrc->icj", half[..., other.numbers].unflatten(2, other.cells.shape), other.J)
+            for other in b.parts
+        ]
+        rows.append(torch.cat(own, 2))
     return torch.cat(rows)
 
 
@@ -85,8 +85,7 @@ def _times(values: Tensor, J: Tensor) -> Tensor:
 
 def _times_points(values: Tensor, A: Tensor) -> Tensor:
     """Values (Ta, N P) times A^T of N rows (N, r, P, 3): (Ta, 3, N r)."""
-    N, r, P, _ = A.shape
-    return torch.einsum("tjp,jrpc->tcjr", values.unflatten(1, (N, P)), A).flatten(2)
+    return torch.einsum("tjp,jrpc->tcjr", values.unflatten(1, A.shape[::2]), A).flatten(2)
 
 
 def _summed_points(half: Tensor, A: Tensor) -> Tensor:

@@ -62,11 +62,13 @@ class Numbers:
         self.row = torch.arange(len(self.q), device=self.q.device).repeat_interleave(rows)
 
     @classmethod
-    def of(cls, q: Tensor, points: Tensor, target: Tensor, S: Tensor, J: Tensor, A: Tensor, shown: Tensor) -> Numbers:
+    def of(
+        cls, q: Tensor, points: Tensor, shown: Tensor, *, target: Tensor, S: Tensor, J: Tensor, A: Tensor
+    ) -> Numbers:
         """Those of a table of N rows with R numbers each, of which the ones ``shown`` (N, R) are there.
 
         Args:
-            q: (N, n). points: (N, 3 P). target: (N, R). S: (N, R, K). J: (N, R, n). A: (N, R, 3 P).
+            q: (N, n). points: (N, 3 P). shown: (N, R). target: (N, R). S: (N, R, K). J: (N, R, n). A: (N, R, 3 P).
         """
         (N, R), P = target.shape, points.shape[1] // 3
         patterns, kind = shown.unique(dim=0, return_inverse=True)
@@ -85,6 +87,11 @@ class Numbers:
         (N, R), (count, _) = self.shape, other.shape
         later = [(*part[:6], part[6] + N * R) for part in other._given]
         return Numbers([*self._given, *later], (N + count, R))
+
+    @property
+    def none(self) -> Numbers:
+        """No numbers, of rows like these."""
+        return Numbers([tuple(values[:0] for values in self._given[0])], (0, self.shape[1]))
 
     @property
     def owner(self) -> Tensor:
@@ -128,5 +135,5 @@ class Numbers:
     def add_blocks(self, matrix: Tensor, blocks: Sequence[Tensor]) -> Tensor:
         """The matrix (M, M), to which the blocks (N, r, r) of every part are added in place."""
         for own, added in zip(self.diagonal_blocks(matrix), blocks, strict=True):
-            own += added
+            own.add_(added)
         return matrix

@@ -24,6 +24,7 @@ from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.covariance import Covariance
 from diffeo_calib.process.numbers import Numbers
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.conditional import NOISE_ADVICE
 
 
 class Factor:
@@ -90,7 +91,7 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The posterior of fields and unknowns by the rows given so far; the prior if there are none.
+    """The posterior of fields and unknowns by the rows given so far.
 
     Args:
         scales: of the fields. space: that of the joints. variance: (K,) prior P of the unknowns.
@@ -100,9 +101,16 @@ class Process:
     scales: Hyperparameters
     space: Space
     variance: Tensor
-    numbers: Numbers | None = None
-    factor: Factor | None = None
-    alpha: Tensor | None = None
+    numbers: Numbers
+    factor: Factor
+    alpha: Tensor
+
+    @classmethod
+    def prior(cls, scales: Hyperparameters, space: Space, variance: Tensor, like: Numbers) -> Process:
+        """What is known before any row; ``like``: numbers of any rows, for their sizes."""
+        none = like.none
+        empty = Factor(variance.new_zeros(0, 0), variance.new_zeros(0, len(variance)))
+        return cls(scales, space, variance, none, empty, none.target)
 
     def given(self, new: Numbers, noise: Sequence[Tensor], at: Expected | None = None) -> Process:
         """Conditioned on more rows.
@@ -114,33 +122,26 @@ class Process:
             NumericalError: their covariance is not positive definite in float64.
         """
         at = self.expected(new) if at is None else at
-        with large_work(at.fields.numel()):
-            L, info = torch.linalg.cholesky_ex(new.add_blocks(at.fields.clone(), noise))
+        F = new.add_blocks(at.fields.clone(), noise)
+        with large_work(F.numel()):
+            L, info = torch.linalg.cholesky_ex(F)
         if int(info):
-            fix = "check for rows that contradict each other beyond any noise, or raise the noise"
-            raise NumericalError.of("the covariance of the rows is not positive definite", fix=fix)
-        right = torch.cat([new.target[:, None], new.S * self.variance.sqrt()], 1)
-        if self.numbers is None:
-            white = torch.linalg.solve_triangular(L, right, upper=False)
-            return replace(self, numbers=new, factor=Factor(L, white[:, 1:]), alpha=white[:, 0])
+            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
         before = torch.cat([self.alpha[:, None], self.factor.W], 1)
-        white = torch.linalg.solve_triangular(L, right - at.white.T @ before, upper=False)
-        top = torch.cat([self.factor.L, at.white.new_zeros(at.white.shape)], 1)
-        whole, both = torch.cat([top, torch.cat([at.white.T, L], 1)]), torch.cat([before, white])
-        return replace(self, numbers=self.numbers.joined(new), factor=Factor(whole, both[:, 1:]), alpha=both[:, 0])
+        right = torch.cat([new.target[:, None], new.S * self.variance.sqrt()], 1) - at.white.T @ before
+        both = torch.cat([before, torch.linalg.solve_triangular(L, right, upper=False)])
+        if len(self.alpha):
+            top = torch.cat([self.factor.L, torch.zeros_like(at.white)], 1)
+            L, new = torch.cat([top, torch.cat([at.white.T, L], 1)]), self.numbers.joined(new)
+        return replace(self, numbers=new, factor=Factor(L, both[:, 1:]), alpha=both[:, 0])
 
     def expected(self, new: Numbers) -> Expected:
         """Numbers as the rows so far predict them."""
-        scaled = new.S * self.variance.sqrt()
-        fields = self._covariance(new, new)
-        if self.numbers is None:
-            return Expected(torch.zeros_like(new.target), fields, scaled, fields[:0])
-        cross = self._covariance(self.numbers, new)
-        V = torch.linalg.solve_triangular(self.factor.L, cross, upper=False)
-        D = scaled - V.T @ self.factor.W
+        V = torch.linalg.solve_triangular(self.factor.L, self._covariance(self.numbers, new), upper=False)
+        D = new.S * self.variance.sqrt() - V.T @ self.factor.W
         mean = V.T @ self.alpha + D @ self._shift
         features = torch.linalg.solve_triangular(self.factor.B, D.T, upper=False).T
-        return Expected(mean, fields - V.T @ V, features, V)
+        return Expected(mean, self._covariance(new, new) - V.T @ V, features, V)
 
     def _covariance(self, a: Numbers, b: Numbers) -> Tensor:
         """Prior covariance by the fields (Ma, Mb)."""

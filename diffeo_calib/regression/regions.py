@@ -85,7 +85,7 @@ def region_scale(
 
 
 def region_factor(freedom: float, dim: int) -> float:
-    """Factor on a Gaussian's variance, estimated with ``freedom`` degrees of freedom, for its 95 % region in ``dim``."""
+    """Factor for the 95 % region in ``dim`` coordinates of a variance estimated with ``freedom`` degrees of freedom."""
     return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 

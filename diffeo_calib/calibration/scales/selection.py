@@ -163,7 +163,7 @@ def log_posterior(
     with torch.enable_grad():
         scales = centre.from_logarithms(point)
         noise = numbers.blocks_of_table(told.weighted_noise(scales))
-        variance, values = data.prior(scales).variance, data.pairs.values(scales)
+        variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
     root = variance.detach().sqrt()
     F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
     factor = Factor.of(F, numbers.S * root)

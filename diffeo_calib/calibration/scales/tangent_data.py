@@ -291,17 +291,21 @@ class TangentData:
         if slopes is None:
             R = told.y.shape[1]
             slopes = torch.eye(R, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), R, R)
-        return Numbers.of(self.x, self.points, told.target, S, told.jacobian, slopes, told.visible)
+        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=slopes)
 
     @cached_property
     def pairs(self) -> Covariance:
         """The covariance of the numbers by the fields, for many scales."""
         return Covariance(self.numbers, self.numbers, self.space)
 
+    def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
+        """(K,) prior variances of theta and of the shifts."""
+        shifts = self.x.new_ones(0 if self.shared is None else self.shared.shape[2])
+        return torch.cat([self.prior_variance(scales), shifts])
+
     def prior(self, scales: Hyperparameters) -> Process:
         """What is known before these rows."""
-        shifts = self.x.new_ones(0 if self.shared is None else self.shared.shape[2])
-        return Process(scales, self.space, torch.cat([self.prior_variance(scales), shifts]))
+        return Process.prior(scales, self.space, self.unknowns_variance(scales), self.numbers)
 
     def expected(self, scales: Hyperparameters) -> Expected:
         """The numbers as they are expected before the rows."""
