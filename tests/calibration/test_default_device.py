@@ -174,7 +174,7 @@ def test_scales(measured: Measured) -> None:
     scales = measured.scales
 
     def work() -> list[Any]:
-        derived = [scales.geometry_only(), scales.inflated(1.5), scales.supported(data.jacobian, data.noise(scales))]
+        derived = [scales.inflated(1.5), scales.supported(data.jacobian, data.noise(scales))]
         return [scales.amplitudes(), scales.prior_variance(data.nominal), *(vars(s) for s in derived)]
 
     same(lambda: [part if isinstance(part, Tensor) else list(part.values()) for part in work()])

@@ -1,12 +1,19 @@
-"""Fixtures of the tests of scales: measurements of every kind after the geometric calibration."""
+"""Linearised rows of every kind of device."""
 
 from __future__ import annotations
 
+import process_bank
 import pytest
+from process_bank import Case
 from tangent_bank import SETTINGS, Setting, built
+
+
+@pytest.fixture(params=list(process_bank.ROWS))
+def case(request: pytest.FixtureRequest) -> Case:
+    return process_bank.case(request.param)
 
 
 @pytest.fixture(params=list(SETTINGS))
 def setting(request: pytest.FixtureRequest) -> Setting:
-    """Measurements of every kind."""
+    """Measurements after the geometric calibration."""
     return built(request.param)
