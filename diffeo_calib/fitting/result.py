@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf, isnan, nan
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import torch
 from torch import Tensor
@@ -224,7 +224,8 @@ class Fit:
         return self.model.deformation.integrator
 
 
-class Stepped(NamedTuple, Generic[D]):
+@dataclass(frozen=True)
+class Stepped(Generic[D]):
     """A run of the flows, what it predicts, and its estimated time-stepping error, m: what certificates need."""
 
     deformation: D
@@ -249,8 +250,8 @@ def certify(
     known: Stepped | None = None,
 ) -> Fit:
     """Compute the certificates of a solution; ``known`` is its run with these time steps, if there was one."""
-    deformation, values, error = known or stepped(objective, solution.momenta, integrator)
-    parts = objective.energy(deformation, values)
+    run = known or stepped(objective, solution.momenta, integrator)
+    parts, deformation = objective.energy(run.deformation, run.values), run.deformation
     return Fit(
         problem=problem,
         model=objective.calibrated(deformation),
@@ -261,7 +262,7 @@ def certify(
         coupling_residual=objective.coupling_residual(deformation),
         end_residual=objective.end_residual(deformation),
         energy_drift=deformation.energy_drift(),
-        step_error=error,
+        step_error=run.error,
         seconds=seconds,
     )
 
