@@ -95,7 +95,7 @@ class Machine:
         code = _kept(mark)
         if code is None:
             code = self._emit(text)
-            with suppress(OSError, RuntimeError, InputError):  # a folder that cannot be written does not matter
+            with suppress(OSError, InputError):  # a folder that cannot be written does not matter
                 write_whole(cache_folder("fused") / mark, hashlib.sha256(code).digest() + code)
         self.engine.add_object_file(self.llvm.ObjectFileRef.from_data(code))
         self.engine.finalize_object()
@@ -121,7 +121,7 @@ def _kept(mark: str) -> bytes | None:
     """The compiled module; None if there is none, or a damaged one."""
     try:
         content = (cache_folder("fused") / mark).read_bytes()
-    except (OSError, RuntimeError):
+    except OSError:
         return None
     digest, code = content[:DIGEST], content[DIGEST:]
     return code if hashlib.sha256(code).digest() == digest else None
