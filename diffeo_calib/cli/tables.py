@@ -122,23 +122,27 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
         rows: None for a table of joint values alone.
 
     Raises:
-        InputError: units that are neither typed nor known.
+        InputError: units that are neither typed nor known, or options in the model that are none.
     """
-    words = shlex.split(command)
-    known = {} if rows is None or rows.named else _read_options(words, Rows)
     own = rows or Rows()
-    if units.length is None or units.angle is None:
-        known |= _read_options(words, Units)
-    words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
+    groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
+    try:
+        stored = shlex.split(command) if groups else []
+        known = {option: texts for group in groups for option, texts in _read_options(stored, group).items()}
+        words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
+        completed = _completed(own, words), _completed(units, words)
+    except (ValueError, IndexError) as error:  # of a file that was edited
+        fix = "name the columns (--position, --socket, --reading), --length and --angle"
+        raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return _completed(own, words), stated_units(_completed(units, words))
+    return completed[0], stated_units(completed[1])
 
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    header = set(read_cells(csv, units.sep)[0])
+    header = set(read_cells(csv, table_format(units).sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}

@@ -127,6 +127,27 @@ class WholeFile:
         return open(name, "wb")  # closed when the file is complete
 
 
+def read_regular(path: Path, kind: str, most: int, error: type[InputError] = InputError) -> bytes:
+    """The content of a file of at most so many bytes; not of a device or a pipe, which may never end.
+
+    Raises:
+        InputError: or the given one: there is no such file, which should be of this kind, or it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
+            raise error.of(what, fix=f"check the path of the {kind}")
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as failure:
+        what = f"'{path}' cannot be read ({failure.strerror})"
+        raise error.of(what, fix="pass the name of a readable file") from failure
+    if len(content) > most:
+        what, expected = f"'{path}' is too large for a {kind}", f"at most {most // 10**6} MB"
+        raise error.of(what, expected=expected, fix=f"pass the {kind} itself")
+    return content
+
+
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a file, see :class:`WholeFile`; InputError if that is not possible."""
     with WholeFile(path) as file:

@@ -23,13 +23,14 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import read_regular, write_whole
 from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE
 
 SAME_ROBOT_TOLERANCE = 1e-9
 """Largest difference, m or rad, between two descriptions of one robot."""
@@ -74,9 +75,7 @@ def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
             raise InputError.of(what, fix="pass the file: `robot`, or --robot URDF")
         return chain.source.encode("utf-8", "surrogateescape")
     path = Path(robot)
-    if not path.is_file():
-        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
-    content = path.read_bytes()
+    content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     _check_same(chain, read_urdf(content, chain.base, chain.tips, path, chain.loads), path)
     return content
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
+from diffeo_calib.common.files import read_regular
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, backwards
-from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE, URDF, JointElement, harmless_faults, joint_of
 
 Names = str | Sequence[str]
 MOVING = frozenset(KINDS) - {"fixed"}
@@ -49,7 +50,7 @@ def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()
             tip that carry other branches, whose weight is left out.
     """
     path = Path(path)
-    content = content_of(path)
+    content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     urdf = URDF.parse(content, path)
     tips, loads = _names("tip", tip), _names("load", load)
     paths = _Paths.between(urdf, base, tips, loads)
@@ -83,7 +84,8 @@ def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
     Raises:
         RobotError: file missing, larger than 100 MB or not a URDF.
     """
-    joints = URDF.parse(content_of(Path(path)), Path(path)).joints
+    path = Path(path)
+    joints = URDF.parse(read_regular(path, "URDF", LARGEST_FILE, RobotError), path).joints
     parents, children = {joint.child: joint for joint in joints}, {joint.parent for joint in joints}
     found = []
     for leaf in [joint.child for joint in joints if joint.child not in children]:

@@ -101,23 +101,6 @@ class URDF:
         raise RobotError.of(what, fix=f"{hint}its links are {few(self.links, MOST_NAMES) or '(none)'}")
 
 
-def content_of(path: Path) -> bytes:
-    """The bytes of a file of reasonable size."""
-    if not path.is_file():
-        what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
-        raise RobotError.of(what, fix="check the path of the URDF")
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        what = f"'{path}' cannot be read ({error.strerror})"
-        raise RobotError.of(what, fix="pass the name of a readable file") from error
-    if len(content) > LARGEST_FILE:
-        what, expected = f"'{path}' is too large for a URDF", f"at most {LARGEST_FILE // 10**6} MB"
-        raise RobotError.of(what, expected=expected, fix="pass the URDF itself")
-    return content
-
-
 def xml_of(content: bytes, path: Path) -> tuple[Any, list[str]]:
     """Root element of the file, and which harmless faults it has.
 
