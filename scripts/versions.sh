@@ -5,9 +5,9 @@
 #   scripts/versions.sh python3.10 ...      these
 #   DIFFEO_CALIB_TESTS="tests" scripts/versions.sh      other tests than the quick ones
 #
-# Every environment is new, in a temporary folder, and removed afterwards. An hour, and 10 GB of downloads where pip finds
-# no CPU build of torch. Of a library only releases count that have a wheel for the Python: the lowest bounds are those of
-# the oldest Python.
+# Every environment is new, in a temporary folder, and removed afterwards. An hour, and 10 GB of downloads: uv installs,
+# and takes a CPU build of torch where UV_FIND_LINKS or UV_TORCH_BACKEND tell it to. Of a library only releases count
+# that have a wheel for the Python: the lowest bounds are those of the oldest Python.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 # One file or more for every library.
@@ -19,7 +19,7 @@ read -ra TESTS <<<"${DIFFEO_CALIB_TESTS:-$QUICK}"
 SUM="import torch, diffeo_calib as dc; dc.Gaussian(1.0).using('keops').field(None, *torch.rand(2, 9, 3, dtype=torch.float64))"
 WORK="$(mktemp -d)"
 trap 'rm -rf "$WORK"' EXIT
-export PYTHONPATH="$PWD" OMP_NUM_THREADS=1
+export PYTHONPATH="$PWD" OMP_NUM_THREADS=1 UV_HTTP_TIMEOUT=300
 
 pythons=("$@")
 if [ $# -eq 0 ]; then
@@ -31,6 +31,8 @@ if [ $# -eq 0 ]; then
 fi
 
 python3 -m venv "$WORK/uv" && "$WORK/uv/bin/pip" install --quiet uv || exit 1
+# A file with a certificate that pip is told of is one for uv too.
+[ -z "${PIP_CERT:-}" ] || export SSL_CERT_FILE="$PIP_CERT"
 uv() { "$WORK/uv/bin/uv" --quiet "$@"; }
 
 table="Python versions install help keops tests demo"
@@ -47,13 +49,13 @@ for python in "${pythons[@]}"; do
     uv venv --clear --python "$("$python" -c 'import sys; print(sys.executable)')" "$own" || exit 1
     row="$("$own/bin/python" -c 'import platform; print(platform.python_version())') $resolution"
     echo "== $row"
-    try install uv pip install --python "$own/bin/python" --only-binary :all: --resolution "$resolution" \
-      -r pyproject.toml --extra test
+    try install uv pip install --python "$own/bin/python" --resolution "$resolution" --only-binary :all: \
+      --no-binary pykeops --no-binary keopscore -r pyproject.toml --extra test
     try help "$own/bin/python" -m diffeo_calib fit --help
     try keops "$own/bin/python" -W error -c "$SUM"
     # The oldest libraries warn of what the newest Python will remove.
     try tests "$own/bin/python" -m pytest -o filterwarnings=default -m "not slow" "${TESTS[@]}"
-    try demo "$own/bin/python" -m diffeo_calib demo --output "$WORK/demo"
+    try demo "$own/bin/python" -m diffeo_calib demo --output "$own/demo"
     table+=$'\n'"$row"
   done
 done

@@ -12,7 +12,7 @@ from torch import Tensor
 from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import read_regular, write_whole
+from diffeo_calib.common.files import read_regular
 
 MATRICES = {"camera_matrix": 9, "distortion_coefficients": 5}
 LARGEST_FILE = 1_000_000
@@ -41,11 +41,6 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
     return "\n".join(
         [*head, *(line for name, rows, data in own for line in matrix_lines(name, rows, data, ros=ros)), ""]
     )
-
-
-def write_camera(path: str | PathLike[str], camera: Camera, *, ros: bool = False) -> None:
-    """Write a camera; arguments as of :func:`camera_text`."""
-    write_whole(path, camera_text(camera, ros=ros).encode())
 
 
 def read_camera(path: str | PathLike[str]) -> Camera:

@@ -129,7 +129,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     try:
         stored = shlex.split(command) if groups else []
         known = {option: texts for group in groups for option, texts in _read_options(stored, group).items()}
-        words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
+        typed = {f"--{name.replace('_', '-')}" for name, value in (vars(own) | vars(units)).items() if value}
+        words = [word for option, texts in known.items() if option not in typed for word in texts]
         completed = _completed(own, words), _completed(units, words)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
@@ -167,11 +168,6 @@ def stated_units(units: StoredUnits) -> Units:
         raise InputError.of(f"{' and '.join(missing)} missing", fix=fix)
     given = {name: value for name, value in asdict(units).items() if value is not None}
     return Units(**given)
-
-
-def _typed(rows: Rows, units: StoredUnits, option: str) -> object:
-    name = option.removeprefix("--").replace("-", "_")
-    return getattr(rows, name, None) or getattr(units, name, None)
 
 
 def _options_of(group: type[Format] | type[Rows]) -> dict[str, tuple[str, Any]]:
@@ -330,11 +326,9 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     """
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (3, count) or not all(isfinite(value) for value in values):
+    words = text.split(",")
+    values = [value for word in words if (value := _number(word)) is not None]
+    if len(words) not in (3, count) or len(values) < len(words):
         expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
         raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
     frame = torch.eye(4, dtype=torch.float64, device=HOST)
@@ -404,11 +398,8 @@ def socket_columns(
 def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     pair, _, length = text.rpartition("=")
     names = tuple(name.strip() for name in pair.split(","))
-    try:
-        value = float(length)
-    except ValueError:
-        value = 0.0
-    if len(names) != 2 or not value > 0.0 or not isfinite(value):
+    value = _number(length) or 0.0
+    if len(names) != 2 or value <= 0.0:
         fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
         raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
     return (names[0], names[1]), value / table.per_metre

@@ -162,7 +162,10 @@ class Fit:
     @property
     def status(self) -> str:
         """Why the fit stopped and, if it did not converge, what to change, in one sentence."""
-        return "; ".join(filter(None, (self._reason, self._usual_advice and (self.advice or self._usual_advice))))
+        reason = self.solution.status
+        if self.solution.stop.converged and not self.converged:
+            reason += f", but the end condition (12) is violated by {100 * self.end_residual:.0f} %"
+        return "; ".join(filter(None, (reason, self._usual_advice and (self.advice or self._usual_advice))))
 
     @property
     def _usual_advice(self) -> str:
@@ -170,12 +173,6 @@ class Fit:
             return self.solution.advice
         unfinished = self.coupling_residual > UNFINISHED_COUPLING_RESIDUAL
         return ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
-
-    @property
-    def _reason(self) -> str:
-        if not self.solution.stop.converged or self.converged:
-            return self.solution.status
-        return f"{self.solution.status}, but the end condition (12) is violated by {100 * self.end_residual:.0f} %"
 
     @property
     def converged(self) -> bool:

@@ -95,7 +95,11 @@ def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
     elements = _joint_elements(content)
     edits: list[_Edit] = []
     for name, origin in origins.items():
-        edits += _origin_edits(content, _only(elements, name, chain), origin)
+        found = [element for element in elements if element.name == name]
+        if len(found) != 1:
+            what, expected = f"the joint '{name}' in the URDF of robot '{chain.name}'", "one <joint> with this name"
+            raise RobotError.of(what, expected=expected, got=len(found), fix="pass its own URDF")
+        edits += _origin_edits(content, found[0], origin)
     for edit in sorted(edits, key=lambda e: e.start, reverse=True):  # from the end, so that places stay right
         content = content[: edit.start] + edit.text + content[edit.stop :]
     _check_read_back(geometry, content)
@@ -142,15 +146,6 @@ def _joint_elements(content: bytes) -> list[_Element]:
     except expat.ExpatError as error:
         raise RobotError.of(f"the URDF is not well-formed XML ({error})", fix="pass a URDF file") from error
     return found
-
-
-def _only(elements: list[_Element], name: str, chain: Tree) -> _Element:
-    """The one <joint> with this name."""
-    found = [element for element in elements if element.name == name]
-    if len(found) != 1:
-        what = f"the joint '{name}' in the URDF of robot '{chain.name}'"
-        raise RobotError.of(what, expected="one <joint> with this name", got=str(len(found)), fix="pass its own URDF")
-    return found[0]
 
 
 def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[_Edit]:

@@ -166,7 +166,8 @@ class _Paths:
         parents, last = [], {self.base: BASE}  # for every link the number of the joint before it
         for step in self.steps:
             before = last[step.start]
-            for joint in _joints_of(step, self.urdf.path):
+            one = joint_of(step.joint, self.urdf.path)
+            for joint in backwards(one) if step.up else [one]:
                 joints.append(joint)
                 parents.append(before)
                 before = len(joints) - 1
@@ -217,12 +218,6 @@ def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> lis
     roots = f"'{base}' below '{up[-1].end if up else base}', '{end}' below '{down[-1].end if down else end}'"
     what = f"links '{base}' and '{end}' are not connected in '{urdf.path}'"
     raise RobotError.of(what, got=roots, fix="choose links of one robot")
-
-
-def _joints_of(step: _Step, path: Path) -> list[Joint]:
-    """A step as joints."""
-    joint = joint_of(step.joint, path)
-    return backwards(joint) if step.up else [joint]
 
 
 def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:

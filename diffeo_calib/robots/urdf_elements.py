@@ -145,7 +145,8 @@ def _read_joint(joint: Any, path: Path) -> JointElement:
     driver = None if mimic is None else mimic.get("joint", "")
     # An <axis> without xyz is no axis: parsers differ in what they make of it.
     axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
-    origin = _origin(joint, where)
+    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
+    origin = transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
     return JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
 
@@ -155,12 +156,6 @@ def _end(joint: Any, part: str, what: str, path: Path) -> str:
     if element is None:
         raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
     return _attribute(element, "link", f"<{part}> of {what}", path)
-
-
-def _origin(joint: Any, where: str) -> Tensor:
-    """Pose (4, 4) of a joint's frame in its parent link's frame [m]."""
-    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
-    return transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
 
 
 def _numbers(

@@ -186,7 +186,8 @@ class Compiled(NamedTuple):
         """
         at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
         large = len(at.features) * right.count >= LARGE_PAIRS
-        side = self._side(right.values.element_size())
+        sizes = right.values.element_size() * sum(self.program.sizes.values()) + 8 * self.program.count
+        side = max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)  # points, a power of two
         if rows is None:
             tiles = mine(range(-(-right.count // side)))
             if not large or not tiles:
@@ -219,11 +220,6 @@ class Compiled(NamedTuple):
             )
             first += size
         return tuple(found)
-
-    def _side(self, bytes_: int) -> int:
-        """Points of a side of a tile: a power of two."""
-        sizes = bytes_ * sum(self.program.sizes.values()) + 8 * self.program.count
-        return max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)
 
     def _zeros(self, like: _Lines) -> Tensor:
         return torch.zeros(self.program.count, like.length, dtype=torch.float64, device=HOST)
