@@ -152,16 +152,6 @@ def _all_markers(detector: Any, grey: np.ndarray) -> list[int]:
     return [] if numbers is None else numbers.ravel().tolist()
 
 
-def _nothing(_: np.ndarray) -> list[int]:
-    return []
-
-
-def _refined(cv2: Any) -> Any:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return parameters
-
-
 def _charuco(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
     markers = _dictionary(cv2, words[3])
     board = cv2.aruco.CharucoBoard(_size(words[0]), float(words[1]), float(words[2]), markers)
@@ -192,7 +182,7 @@ def _chessboard(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
         found, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=cv2.CALIB_CB_ACCURACY)
         return (np.arange(len(points)), corners.reshape(-1, 2).astype(float)) if found else NONE
 
-    return points, find, _nothing
+    return points, find, lambda _: []
 
 
 def _grid(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
@@ -211,7 +201,9 @@ def _tag(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
 
 def _of_markers(cv2: Any, markers: Any, own: dict[int, int]) -> tuple[Any, Any]:
     """Corners of the markers with these numbers, four each."""
-    detector = cv2.aruco.ArucoDetector(markers, _refined(cv2))
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(markers, parameters)
 
     def find(grey: np.ndarray) -> Found:
         corners, seen, _ = detector.detectMarkers(grey)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+from math import inf
 from os import PathLike
 from pathlib import Path
 
@@ -12,9 +12,13 @@ from torch import Tensor
 from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import read_regular
 
 MATRICES = {"camera_matrix": 9, "distortion_coefficients": 5}
+LARGEST_FILE = 1_000_000
+"""Bytes of a file that no camera has."""
+LARGEST = 1e6
+"""Above all numbers of cameras: focal lengths are some thousand pixels."""
 BOARD, ROOT = "board", "root"
 """Matrices that only files of this package hold: (5,) of the board, and (14, c) of the uncertainty."""
 
@@ -39,11 +43,6 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
     )
 
 
-def write_camera(path: str | PathLike[str], camera: Camera, *, ros: bool = False) -> None:
-    """Write a camera; arguments as of :func:`camera_text`."""
-    write_whole(path, camera_text(camera, ros=ros).encode())
-
-
 def read_camera(path: str | PathLike[str]) -> Camera:
     """The camera of a file of this package, of OpenCV or of ROS.
 
@@ -54,8 +53,8 @@ def read_camera(path: str | PathLike[str]) -> Camera:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_regular(file, "camera file", LARGEST_FILE).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError.of(f"file '{file}'", expected="a camera's YAML file", got=str(error)) from None
     values = {name: _numbers(file, text, name, count) for name, count in MATRICES.items()}
     fx, _, cx, _, fy, cy = values["camera_matrix"][:6].tolist()
@@ -65,7 +64,7 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         raise InputError.of(
             f"file '{file}'", expected="positive focal lengths and image size", got=f"{fx}, {fy}, {width}, {height}"
         )
-    if f"{ROOT}:" not in text:
+    if f"\n{ROOT}:" not in text:
         return Camera(width, height, 0.0, torch.cat([lens, lens.new_zeros(5)]), lens.new_zeros(len(UNKNOWNS), 0))
     root = _numbers(file, text, ROOT, None).view(len(UNKNOWNS), -1)
     half, noise = (_number(file, text, name) for name in ("board_half_size", "avg_reprojection_error"))
@@ -86,22 +85,29 @@ def matrix_lines(name: str, rows: int, data: list[float], *, ros: bool = False) 
 
 
 def _numbers(file: Path, text: str, name: str, count: int | None) -> Tensor:
-    found = re.search(rf"^{name}:.*?data:\s*\[(.*?)\]", text, re.S | re.M)
-    words = [] if found is None else found[1].replace(",", " ").split()
+    """The numbers of a matrix; of the root those of whole rows."""
+    data = f"\n{text}".partition(f"\n{name}:")[2].partition("data:")[2].lstrip()
+    inside, end, _ = data.partition("]")
     try:
-        values = torch.tensor([float(word) for word in words], dtype=torch.float64, device=HOST)
+        values = [float(word) for word in inside.removeprefix("[").replace(",", " ").split()] if end else []
     except ValueError:
-        values = torch.zeros(0, dtype=torch.float64, device=HOST)
+        values = []
     if name == "distortion_coefficients" and len(values) == 4:
-        values = torch.cat([values, values.new_zeros(1)])
-    if not len(values) or (count is not None and len(values) != count) or not bool(values.isfinite().all()):
-        expected = f"a matrix `{name}`" + f" of {count} numbers" * (count is not None)
+        values.append(0.0)
+    right = len(values) == count if count else values and len(values) % len(UNKNOWNS) == 0
+    if not right or not all(abs(value) < LARGEST for value in values):
+        expected = f"a matrix `{name}` of {count or f'{len(UNKNOWNS)} rows of'} numbers below {LARGEST:.0e}"
         raise InputError.of(f"file '{file}'", expected=expected, got=f"{len(values)} numbers", fix="check the file")
-    return values
+    return torch.tensor(values, dtype=torch.float64, device=HOST)
 
 
 def _number(file: Path, text: str, name: str) -> float:
-    found = re.search(rf"^{name}:\s*([-+.\deE]+)\s*$", text, re.M)
-    if found is None:
-        raise InputError.of(f"file '{file}'", expected=f"a line `{name}: NUMBER`", fix="check the file")
-    return float(found[1])
+    word = f"\n{text}".partition(f"\n{name}:")[2].partition("\n")[0].strip()
+    try:
+        value = float(word)
+    except ValueError:
+        value = inf
+    if not 0.0 <= value < LARGEST:
+        expected = f"a line `{name}: NUMBER`, positive and below {LARGEST:.0e}"
+        raise InputError.of(f"file '{file}'", expected=expected, got=repr(word), fix="check the file")
+    return value

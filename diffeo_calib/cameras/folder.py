@@ -131,7 +131,8 @@ def read_folders(
 def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]], progress: Progress) -> Folder:
     """Find the board in the files of one folder, with the cells of their rows."""
     board = empty.board
-    read = [_grey(folder / file) for file, _ in known]
+    cv2 = opencv()
+    read = [cv2.imread(str(folder / file), cv2.IMREAD_GRAYSCALE) for file, _ in known]
     sizes = Counter(image.shape for image in read if image is not None)
     if not sizes:
         raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
@@ -193,11 +194,6 @@ def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:
         return header.index(IMAGE)
     named = (k for k in range(len(header)) if all(Path(row[k].strip()).suffix.lower() in SUFFIXES for row in rows))
     return next(named, None)
-
-
-def _grey(path: Path) -> np.ndarray | None:
-    cv2 = opencv()
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, usual: tuple[int, ...]) -> Seen:

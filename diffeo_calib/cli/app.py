@@ -126,7 +126,7 @@ def command(name: str) -> Callable[[Command], Command]:
     """Declare a command; parameters whose type is a dataclass are groups of options, and every command has --json."""
 
     def declare(function: Command) -> Command:
-        hints = get_type_hints(function, include_extras=True)
+        hints = inspect.get_annotations(function, eval_str=True)  # get_type_hints of 3.10 hides options of None
         groups: dict[str, Any] = {key: hint for key, hint in hints.items() if is_dataclass(hint)}
 
         def run(**given: Any) -> None:

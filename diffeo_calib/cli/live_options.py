@@ -21,7 +21,12 @@ class LiveOptions:
         "campaign/feeds.py describes them. Addresses of other machines need --token.",
         "[HOST:]PORT",
     )
-    token: str = option("What a program must send first to --listen.", "TEXT", default="")
+    token: str = option(
+        "What a program must send first to --listen; other users of this machine see what is typed, not the variable.",
+        "TEXT",
+        default="",
+        envvar="DIFFEO_CALIB_TOKEN",
+    )
     json_lines: bool = option(
         "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
     )

@@ -122,23 +122,28 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
         rows: None for a table of joint values alone.
 
     Raises:
-        InputError: units that are neither typed nor known.
+        InputError: units that are neither typed nor known, or options in the model that are none.
     """
-    words = shlex.split(command)
-    known = {} if rows is None or rows.named else _read_options(words, Rows)
     own = rows or Rows()
-    if units.length is None or units.angle is None:
-        known |= _read_options(words, Units)
-    words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
+    groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
+    try:
+        stored = shlex.split(command) if groups else []
+        known = {option: texts for group in groups for option, texts in _read_options(stored, group).items()}
+        typed = {f"--{name.replace('_', '-')}" for name, value in (vars(own) | vars(units)).items() if value}
+        words = [word for option, texts in known.items() if option not in typed for word in texts]
+        completed = _completed(own, words), _completed(units, words)
+    except (ValueError, IndexError) as error:  # of a file that was edited
+        fix = "name the columns (--position, --socket, --reading), --length and --angle"
+        raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return _completed(own, words), stated_units(_completed(units, words))
+    return completed[0], stated_units(completed[1])
 
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    header = set(read_cells(csv, units.sep)[0])
+    header = set(read_cells(csv, table_format(units).sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}
@@ -163,11 +168,6 @@ def stated_units(units: StoredUnits) -> Units:
         raise InputError.of(f"{' and '.join(missing)} missing", fix=fix)
     given = {name: value for name, value in asdict(units).items() if value is not None}
     return Units(**given)
-
-
-def _typed(rows: Rows, units: StoredUnits, option: str) -> object:
-    name = option.removeprefix("--").replace("-", "_")
-    return getattr(rows, name, None) or getattr(units, name, None)
 
 
 def _options_of(group: type[Format] | type[Rows]) -> dict[str, tuple[str, Any]]:
@@ -326,11 +326,9 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     """
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (3, count) or not all(isfinite(value) for value in values):
+    words = text.split(",")
+    values = [value for word in words if (value := _number(word)) is not None]
+    if len(words) not in (3, count) or len(values) < len(words):
         expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
         raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
     frame = torch.eye(4, dtype=torch.float64, device=HOST)
@@ -400,11 +398,8 @@ def socket_columns(
 def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     pair, _, length = text.rpartition("=")
     names = tuple(name.strip() for name in pair.split(","))
-    try:
-        value = float(length)
-    except ValueError:
-        value = 0.0
-    if len(names) != 2 or not value > 0.0 or not isfinite(value):
+    value = _number(length) or 0.0
+    if len(names) != 2 or value <= 0.0:
         fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
         raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
     return (names[0], names[1]), value / table.per_metre

@@ -127,6 +127,27 @@ class WholeFile:
         return open(name, "wb")  # closed when the file is complete
 
 
+def read_regular(path: Path, kind: str, most: int, error: type[InputError] = InputError) -> bytes:
+    """The content of a file of at most so many bytes; not of a device or a pipe, which may never end.
+
+    Raises:
+        InputError: or the given one: there is no such file, which should be of this kind, or it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
+            raise error.of(what, fix=f"check the path of the {kind}")
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as failure:
+        what = f"'{path}' cannot be read ({failure.strerror})"
+        raise error.of(what, fix="pass the name of a readable file") from failure
+    if len(content) > most:
+        what, expected = f"'{path}' is too large for a {kind}", f"at most {most // 10**6} MB"
+        raise error.of(what, expected=expected, fix=f"pass the {kind} itself")
+    return content
+
+
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a file, see :class:`WholeFile`; InputError if that is not possible."""
     with WholeFile(path) as file:
@@ -208,19 +229,14 @@ def _lock(file: IO[bytes], *, wait: bool) -> bool:
 def _take_permissions(part: Path, target: Path) -> None:
     """Those of the existing file, and its owner where that is possible; of a new file the usual ones."""
     if not target.exists():
-        part.chmod(0o666 & ~_umask())
+        mask = os.umask(0o022)  # it can only be read by setting it
+        os.umask(mask)
+        part.chmod(0o666 & ~mask)
         return
     known = target.stat()
     with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows
         os.chown(part, known.st_uid, known.st_gid)
     part.chmod(known.st_mode & 0o777)
-
-
-def _umask() -> int:
-    """Permissions that new files do not get; mkstemp's files are readable by their owner only."""
-    mask = os.umask(0o022)  # the mask can only be read by setting it
-    os.umask(mask)
-    return mask
 
 
 IMAGE_SUFFIXES = (".png", ".pdf", ".svg")

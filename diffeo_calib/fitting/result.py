@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf, isnan, nan
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import torch
 from torch import Tensor
@@ -162,7 +162,10 @@ class Fit:
     @property
     def status(self) -> str:
         """Why the fit stopped and, if it did not converge, what to change, in one sentence."""
-        return "; ".join(filter(None, (self._reason, self._usual_advice and (self.advice or self._usual_advice))))
+        reason = self.solution.status
+        if self.solution.stop.converged and not self.converged:
+            reason += f", but the end condition (12) is violated by {100 * self.end_residual:.0f} %"
+        return "; ".join(filter(None, (reason, self._usual_advice and (self.advice or self._usual_advice))))
 
     @property
     def _usual_advice(self) -> str:
@@ -170,12 +173,6 @@ class Fit:
             return self.solution.advice
         unfinished = self.coupling_residual > UNFINISHED_COUPLING_RESIDUAL
         return ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
-
-    @property
-    def _reason(self) -> str:
-        if not self.solution.stop.converged or self.converged:
-            return self.solution.status
-        return f"{self.solution.status}, but the end condition (12) is violated by {100 * self.end_residual:.0f} %"
 
     @property
     def converged(self) -> bool:
@@ -224,7 +221,8 @@ class Fit:
         return self.model.deformation.integrator
 
 
-class Stepped(NamedTuple, Generic[D]):
+@dataclass(frozen=True)
+class Stepped(Generic[D]):
     """A run of the flows, what it predicts, and its estimated time-stepping error, m: what certificates need."""
 
     deformation: D
@@ -249,8 +247,8 @@ def certify(
     known: Stepped | None = None,
 ) -> Fit:
     """Compute the certificates of a solution; ``known`` is its run with these time steps, if there was one."""
-    deformation, values, error = known or stepped(objective, solution.momenta, integrator)
-    parts = objective.energy(deformation, values)
+    run = known or stepped(objective, solution.momenta, integrator)
+    parts, deformation = objective.energy(run.deformation, run.values), run.deformation
     return Fit(
         problem=problem,
         model=objective.calibrated(deformation),
@@ -261,7 +259,7 @@ def certify(
         coupling_residual=objective.coupling_residual(deformation),
         end_residual=objective.end_residual(deformation),
         energy_drift=deformation.energy_drift(),
-        step_error=error,
+        step_error=run.error,
         seconds=seconds,
     )
 

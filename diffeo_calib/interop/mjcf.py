@@ -63,9 +63,9 @@ def mjcf_text(geometry: Geometry) -> str:
     etree.SubElement(root, "compiler", angle="radian", autolimits="true", **limits)
     world = etree.SubElement(root, "worldbody")
     bodies: dict[int, Any] = {BASE: etree.SubElement(world, "body", name=chain.base)}
-    origins, links = _origins(geometry), _Links(chain)
+    errors, links = iter(geometry.joint_errors), _Links(chain)
     for number, (joint, parent) in enumerate(zip(chain.joints, chain.parents, strict=True)):
-        placed = _placed(origins[number])
+        placed = _placed(joint.origin if joint.kind == "fixed" else joint.origin @ next(errors))
         bodies[number] = body = etree.SubElement(bodies[parent], "body", name=links.name(joint.name), **placed)
         if (inertial := links.inertial(joint.name)) is not None:
             etree.SubElement(body, "inertial", **inertial)
@@ -79,12 +79,6 @@ def mjcf_text(geometry: Geometry) -> str:
         for joint in mimics:
             etree.SubElement(together, "joint", **_following(joint, chain))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
-
-
-def _origins(geometry: Geometry) -> list[Tensor]:
-    """Where every joint's frame is in that of the joint before it, (4, 4) each, m."""
-    errors = iter(geometry.joint_errors)
-    return [j.origin if j.kind == "fixed" else j.origin @ next(errors) for j in geometry.chain.joints]
 
 
 def _placed(transform: Tensor) -> dict[str, str]:

@@ -23,13 +23,14 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import read_regular, write_whole
 from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE
 
 SAME_ROBOT_TOLERANCE = 1e-9
 """Largest difference, m or rad, between two descriptions of one robot."""
@@ -74,9 +75,7 @@ def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
             raise InputError.of(what, fix="pass the file: `robot`, or --robot URDF")
         return chain.source.encode("utf-8", "surrogateescape")
     path = Path(robot)
-    if not path.is_file():
-        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
-    content = path.read_bytes()
+    content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     _check_same(chain, read_urdf(content, chain.base, chain.tips, path, chain.loads), path)
     return content
 
@@ -96,7 +95,11 @@ def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
     elements = _joint_elements(content)
     edits: list[_Edit] = []
     for name, origin in origins.items():
-        edits += _origin_edits(content, _only(elements, name, chain), origin)
+        found = [element for element in elements if element.name == name]
+        if len(found) != 1:
+            what, expected = f"the joint '{name}' in the URDF of robot '{chain.name}'", "one <joint> with this name"
+            raise RobotError.of(what, expected=expected, got=len(found), fix="pass its own URDF")
+        edits += _origin_edits(content, found[0], origin)
     for edit in sorted(edits, key=lambda e: e.start, reverse=True):  # from the end, so that places stay right
         content = content[: edit.start] + edit.text + content[edit.stop :]
     _check_read_back(geometry, content)
@@ -143,15 +146,6 @@ def _joint_elements(content: bytes) -> list[_Element]:
     except expat.ExpatError as error:
         raise RobotError.of(f"the URDF is not well-formed XML ({error})", fix="pass a URDF file") from error
     return found
-
-
-def _only(elements: list[_Element], name: str, chain: Tree) -> _Element:
-    """The one <joint> with this name."""
-    found = [element for element in elements if element.name == name]
-    if len(found) != 1:
-        what = f"the joint '{name}' in the URDF of robot '{chain.name}'"
-        raise RobotError.of(what, expected="one <joint> with this name", got=str(len(found)), fix="pass its own URDF")
-    return found[0]
 
 
 def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[_Edit]:

@@ -252,15 +252,6 @@ def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
     return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(-3, -2)
 
 
-def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
-    """Covariance of (dt, dw) that follows from one of the three points: (N, 9, 9), (N, 4, 4) -> (N, 6, 6).
-
-    Units: m^2, m rad and rad^2; dw is a small rotation about the axes of the measuring frame.
-    """
-    wanted = pose_directions(poses, lever)
-    return wanted @ covariance @ wanted.mT
-
-
 def pose_directions(poses: Tensor, lever: float) -> Tensor:
     """Derivatives of (dt, dw) by the three points, as poses_from_marks to first order: (..., 4, 4) -> (..., 6, 9)."""
     J = mark_jacobian(poses, lever)

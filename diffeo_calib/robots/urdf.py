@@ -9,9 +9,10 @@ from pathlib import Path
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
+from diffeo_calib.common.files import read_regular
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, backwards
-from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE, URDF, JointElement, harmless_faults, joint_of
 
 Names = str | Sequence[str]
 MOVING = frozenset(KINDS) - {"fixed"}
@@ -49,7 +50,7 @@ def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()
             tip that carry other branches, whose weight is left out.
     """
     path = Path(path)
-    content = content_of(path)
+    content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     urdf = URDF.parse(content, path)
     tips, loads = _names("tip", tip), _names("load", load)
     paths = _Paths.between(urdf, base, tips, loads)
@@ -83,7 +84,8 @@ def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
     Raises:
         RobotError: file missing, larger than 100 MB or not a URDF.
     """
-    joints = URDF.parse(content_of(Path(path)), Path(path)).joints
+    path = Path(path)
+    joints = URDF.parse(read_regular(path, "URDF", LARGEST_FILE, RobotError), path).joints
     parents, children = {joint.child: joint for joint in joints}, {joint.parent for joint in joints}
     found = []
     for leaf in [joint.child for joint in joints if joint.child not in children]:
@@ -164,7 +166,8 @@ class _Paths:
         parents, last = [], {self.base: BASE}  # for every link the number of the joint before it
         for step in self.steps:
             before = last[step.start]
-            for joint in _joints_of(step, self.urdf.path):
+            one = joint_of(step.joint, self.urdf.path)
+            for joint in backwards(one) if step.up else [one]:
                 joints.append(joint)
                 parents.append(before)
                 before = len(joints) - 1
@@ -215,12 +218,6 @@ def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> lis
     roots = f"'{base}' below '{up[-1].end if up else base}', '{end}' below '{down[-1].end if down else end}'"
     what = f"links '{base}' and '{end}' are not connected in '{urdf.path}'"
     raise RobotError.of(what, got=roots, fix="choose links of one robot")
-
-
-def _joints_of(step: _Step, path: Path) -> list[Joint]:
-    """A step as joints."""
-    joint = joint_of(step.joint, path)
-    return backwards(joint) if step.up else [joint]
 
 
 def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:

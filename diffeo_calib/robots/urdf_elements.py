@@ -101,23 +101,6 @@ class URDF:
         raise RobotError.of(what, fix=f"{hint}its links are {few(self.links, MOST_NAMES) or '(none)'}")
 
 
-def content_of(path: Path) -> bytes:
-    """The bytes of a file of reasonable size."""
-    if not path.is_file():
-        what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
-        raise RobotError.of(what, fix="check the path of the URDF")
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        what = f"'{path}' cannot be read ({error.strerror})"
-        raise RobotError.of(what, fix="pass the name of a readable file") from error
-    if len(content) > LARGEST_FILE:
-        what, expected = f"'{path}' is too large for a URDF", f"at most {LARGEST_FILE // 10**6} MB"
-        raise RobotError.of(what, expected=expected, fix="pass the URDF itself")
-    return content
-
-
 def xml_of(content: bytes, path: Path) -> tuple[Any, list[str]]:
     """Root element of the file, and which harmless faults it has.
 
@@ -162,7 +145,8 @@ def _read_joint(joint: Any, path: Path) -> JointElement:
     driver = None if mimic is None else mimic.get("joint", "")
     # An <axis> without xyz is no axis: parsers differ in what they make of it.
     axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
-    origin = _origin(joint, where)
+    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
+    origin = transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
     return JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
 
@@ -172,12 +156,6 @@ def _end(joint: Any, part: str, what: str, path: Path) -> str:
     if element is None:
         raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
     return _attribute(element, "link", f"<{part}> of {what}", path)
-
-
-def _origin(joint: Any, where: str) -> Tensor:
-    """Pose (4, 4) of a joint's frame in its parent link's frame [m]."""
-    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
-    return transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
 
 
 def _numbers(

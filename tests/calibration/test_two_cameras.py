@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cameras.files import read_camera, write_camera
+from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.interop.camera_files import camera_files
@@ -267,7 +267,7 @@ def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> 
     table, options = kind().table()
     shutil.copy(table, tmp_path / "corners.csv")
     for name, camera in kind().data.cameras.items():
-        write_camera(tmp_path / f"{name}.yaml", camera)
+        (tmp_path / f"{name}.yaml").write_text(camera_text(camera))
     files = [f"--reading=corners={tmp_path / f'{name}.yaml'}" for name in ("left", "right")]
     others = [word for word in options if "corners" not in word and word != "--reading"]
     words = ["fit", tmp_path / "corners.csv", *kind().robot_options, *others, "--holdout", "0"]
@@ -289,7 +289,7 @@ def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path
     table, _ = kind().table()
     shutil.copy(table, tmp_path / "corners.csv")
     for name, camera in kind().data.cameras.items():
-        write_camera(tmp_path / f"{name}.yaml", camera)
+        (tmp_path / f"{name}.yaml").write_text(camera_text(camera))
     done = command("init", tmp_path / "corners.csv", kind().urdf, "-o", tmp_path / "campaign.toml")
     assert done.code == 0, done.err
     text = (tmp_path / "campaign.toml").read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from torch.autograd.functional import jacobian
 from torch.testing import assert_close
 
 from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
-from diffeo_calib.cameras.files import read_camera, write_camera
+from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -150,7 +152,7 @@ def test_a_known_lens_stays() -> None:
 
 def test_files_keep_a_camera(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
-    write_camera(path, FOUND.camera)
+    path.write_text(camera_text(FOUND.camera))
     same = read_camera(path)
     assert_close(same.unknowns, FOUND.camera.unknowns, rtol=0, atol=0)
     assert_close(same.root, FOUND.camera.root, rtol=0, atol=0)
@@ -160,7 +162,7 @@ def test_files_keep_a_camera(tmp_path: Path) -> None:
 def test_opencv_reads_the_file(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2")
     path = tmp_path / "camera.yaml"
-    write_camera(path, FOUND.camera)
+    path.write_text(camera_text(FOUND.camera))
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     assert file.getNode("camera_matrix").mat()[0, 2] == float(FOUND.camera.lens[2])
     assert file.getNode("distortion_coefficients").mat().ravel().tolist() == FOUND.camera.lens[4:].tolist()
@@ -169,7 +171,7 @@ def test_opencv_reads_the_file(tmp_path: Path) -> None:
 
 def test_files_of_ros_hold_a_lens(tmp_path: Path) -> None:
     path = tmp_path / "camera_info.yaml"
-    write_camera(path, FOUND.camera, ros=True)
+    path.write_text(camera_text(FOUND.camera, ros=True))
     assert "plumb_bob" in path.read_text()
     found = read_camera(path)
     assert_close(found.lens, FOUND.camera.lens, rtol=0, atol=0)
@@ -181,6 +183,41 @@ def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"camera\.yaml.*camera_matrix"):
+        read_camera(path)
+
+
+FILE = camera_text(FOUND.camera)
+DAMAGED = {
+    "a number that is none": (r"image_width: \d+", "image_width: e", "image_width"),
+    "an endless number": (r"image_width: \d+", "image_width: 1e999", "image_width"),
+    "a negative size": (r"image_height: \d+", "image_height: -5", "image_height"),
+    "no row of the root": (r"root:(.*)data: \[[^,]*, ", r"root:\1data: [", "root"),
+    "no root": (r"root:(.*)data: \[.*\]", r"root:\1data: []", "root"),
+    "a matrix without an end": (r"\]", "", "camera_matrix"),
+    "a number beyond all cameras": (r"data: \[", "data: [1e300, ", "camera_matrix"),
+    "no text": (r"camera_matrix", "\udcff", "utf-8"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_files_are_refused(damage: str, tmp_path: Path) -> None:
+    pattern, other, message = DAMAGED[damage]
+    path = tmp_path / "camera.yaml"
+    path.write_bytes(re.sub(pattern, other, FILE, flags=re.S).encode("utf-8", "surrogateescape"))
+    with pytest.raises(InputError, match=rf"camera\.yaml.*{message}"):
+        read_camera(path)
+
+
+@pytest.mark.parametrize("piece", ["camera_matrix:\n", "camera_matrix:\n data: [", " "])
+def test_long_files_are_refused_at_once(piece: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("camera_matrix:" + piece * (900_000 // len(piece)))
+    begin = time.perf_counter()
+    with pytest.raises(InputError, match="camera_matrix"):
+        read_camera(path)
+    assert time.perf_counter() - begin < 5.0
+    path.write_text(piece * (1_100_000 // len(piece)))
+    with pytest.raises(InputError, match="too large for a camera file: expected at most 1 MB"):
         read_camera(path)
 
 

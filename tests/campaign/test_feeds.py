@@ -137,13 +137,18 @@ def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[...,
     assert (answer["line"], answer["accepted_rows"]) == (7, 5)
 
 
-def test_a_token_is_asked_for(run: Callable[..., tuple[Outcome, Any]]) -> None:
+@pytest.mark.parametrize("typed", [True, False])
+def test_a_token_is_asked_for(
+    typed: bool, run: Callable[..., tuple[Outcome, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def client(port: int) -> list[dict[str, Any]]:
         words = b'{"token": "secret"}\n', b'{"token": "no"}\n', row(1)
         with Client(port, words[0]) as known, Client(port, words[1]) as other, Client(port, words[2]) as third:
             return [known.first, known.ask(row(0)), other.first, third.first]
 
-    _, (first, answer, *others) = run(client, "--token", "secret", "--json-lines")
+    if not typed:
+        monkeypatch.setenv("DIFFEO_CALIB_TOKEN", "secret")
+    _, (first, answer, *others) = run(client, *["--token", "secret"] * typed, "--json-lines")
     assert first["rows"] == 0
     assert answer["accepted"]
     assert all("token" in one["error"] for one in others)

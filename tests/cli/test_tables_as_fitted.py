@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from io import StringIO
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rich.console import Console
 import diffeo_calib as dc
 from diffeo_calib.cli.options import Angle, Length, Rows, StoredUnits
 from diffeo_calib.cli.printed import ErrorTable
-from diffeo_calib.cli.tables import as_at_the_fit, measured_table, stated_units
+from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table, stated_units
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -45,6 +46,37 @@ def test_units_are_never_guessed() -> None:
             as_at_the_fit(command, Rows(position=["x,y,z"]), StoredUnits())
     with pytest.raises(InputError, match="--angle missing"):
         stated_units(StoredUnits(length=Length.m))
+
+
+@pytest.mark.parametrize(
+    "words", ["--position 'x,y,z", "--position", "--length furlong", "--lever long --angle deg", "--angle=turns"]
+)
+def test_options_that_are_none_are_one_error(words: str) -> None:
+    """Whoever sends a model file may have edited the line in it."""
+    command = f"diffeo-calib fit t.csv --position x,y,z --length mm {words}"
+    with pytest.raises(InputError, match=r"the options that the model was fitted with: got .*; name the columns"):
+        as_at_the_fit(command, Rows(), StoredUnits())
+    rows, units = as_at_the_fit(command, Rows(position=["a,b,c"]), StoredUnits(length=Length.m, angle=Angle.rad))
+    assert (rows.position, units.angle) == (["a,b,c"], Angle.rad)  # nothing of it is needed
+
+
+@pytest.mark.parametrize("sep", ["ab", ""])
+def test_a_separator_that_is_none_is_one_error(sep: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("q1,x,y,z\n")
+    command = f"diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep '{sep}'"
+    with pytest.raises(InputError, match="`sep`: expected one character"):
+        rows_in_table(tmp_path / "t.csv", *as_at_the_fit(command, Rows(), StoredUnits()))
+
+
+@pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])
+def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device or a pipe would never end."""
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    command = f"diffeo-calib fit t.csv --reading corners={place} --length mm --angle deg"
+    rows, units = as_at_the_fit(command, Rows(), StoredUnits())
+    with pytest.raises(InputError, match=r"(is|there is) no file.* check the path of the camera file"):
+        measured_table(tmp_path / "t.csv", rows, units)
 
 
 def test_model_and_table_are_enough(

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -20,10 +19,11 @@ from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Chain
 
+mujoco: Any = pytest.importorskip("mujoco")
 MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="lift" multiplier="-0.5" offset="0.2"/>')
 
 
-def tip_poses(model: mujoco.MjModel, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
+def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
     """Poses (N, 4, 4) of the first tip as MuJoCo has them."""
     data, found = mujoco.MjData(model), torch.eye(4, dtype=torch.float64).repeat(len(q), 1, 1)
     for row, values in enumerate(chain.moving_values(q).numpy()):

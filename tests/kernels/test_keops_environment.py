@@ -65,6 +65,13 @@ def test_every_set_of_flags_has_its_own_cache_folder(tmp_path: Path) -> None:
     assert Path(folders[0]).is_dir()
 
 
+def test_without_a_folder_that_can_be_made_there_is_one_for_the_process() -> None:
+    code = "import warnings\nwarnings.simplefilter('ignore')" + LOAD
+    folder = Path(in_a_process(code, XDG_CACHE_HOME="/dev/null")[-1])
+    assert folder.name.startswith("diffeo_calib-")
+    assert not folder.exists()
+
+
 FALL_BACK = """
 import json, sys, warnings
 import torch
@@ -100,7 +107,11 @@ print(json.dumps([texts, calls, backends.choose("keops", 9, 9, torch.device("cpu
 TROUBLES: dict[str, tuple[dict[str, str], str, tuple[int, int]]] = {
     "no pykeops": ({}, r"pykeops cannot be imported \(.*\)\.", (1, 0)),
     "no compiler": ({"PATH": ""}, r"KeOps finds no C\+\+ compiler; install g\+\+, or set CXX\.", (1, 0)),
-    "no cache folder": ({"XDG_CACHE_HOME": "/dev/null"}, r"pykeops cannot be imported \(.*\)\.", (1, 0)),
+    "no folder for files": (
+        {"XDG_CACHE_HOME": "/dev/null", "KEOPS_CACHE_FOLDER": "/dev/null/keops"},
+        r"pykeops cannot be imported \(.*\)\.",
+        (1, 0),
+    ),
     "a compiler that fails": (
         {"CXX": "false"},
         r"KeOps could not compile or run a kernel sum \(.*\)\.",

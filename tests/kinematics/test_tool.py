@@ -14,7 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.tool import tool_points
-from diffeo_calib.measurements.poses import angle_between, mark_points, pose_covariances, poses_from_marks
+from diffeo_calib.measurements.poses import angle_between, mark_points, pose_directions, poses_from_marks
 from diffeo_calib.robots.se3 import rotation
 
 LEVER = 0.1
@@ -130,7 +130,8 @@ def test_covariance_in_the_base_frame_is_turned_into_its_axes(arm: Case) -> None
     sensitivity = at.sensitivity.clone()
     sensitivity[..., :6] = 0.0
     seen = model.tool_poses(q, tool, "measuring")
-    measured = pose_covariances(model.map.covariance_at(replace(at, sensitivity=sensitivity)), seen, LEVER)
+    wanted = pose_directions(seen, LEVER)
+    measured = wanted @ model.map.covariance_at(replace(at, sensitivity=sensitivity)) @ wanted.mT
     R = model.geometry.base[:3, :3]
     turn = torch.block_diag(R.mT, R.mT)
     found = model.predict_tool_poses(q, tool, "base")[1]

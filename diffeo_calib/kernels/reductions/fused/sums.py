@@ -95,7 +95,7 @@ class Machine:
         code = _kept(mark)
         if code is None:
             code = self._emit(text)
-            with suppress(OSError, RuntimeError, InputError):  # a folder that cannot be written does not matter
+            with suppress(OSError, InputError):  # a folder that cannot be written does not matter
                 write_whole(cache_folder("fused") / mark, hashlib.sha256(code).digest() + code)
         self.engine.add_object_file(self.llvm.ObjectFileRef.from_data(code))
         self.engine.finalize_object()
@@ -121,7 +121,7 @@ def _kept(mark: str) -> bytes | None:
     """The compiled module; None if there is none, or a damaged one."""
     try:
         content = (cache_folder("fused") / mark).read_bytes()
-    except (OSError, RuntimeError):
+    except OSError:
         return None
     digest, code = content[:DIGEST], content[DIGEST:]
     return code if hashlib.sha256(code).digest() == digest else None
@@ -186,7 +186,8 @@ class Compiled(NamedTuple):
         """
         at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
         large = len(at.features) * right.count >= LARGE_PAIRS
-        side = self._side(right.values.element_size())
+        sizes = right.values.element_size() * sum(self.program.sizes.values()) + 8 * self.program.count
+        side = max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)  # points, a power of two
         if rows is None:
             tiles = mine(range(-(-right.count // side)))
             if not large or not tiles:
@@ -219,11 +220,6 @@ class Compiled(NamedTuple):
             )
             first += size
         return tuple(found)
-
-    def _side(self, bytes_: int) -> int:
-        """Points of a side of a tile: a power of two."""
-        sizes = bytes_ * sum(self.program.sizes.values()) + 8 * self.program.count
-        return max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)
 
     def _zeros(self, like: _Lines) -> Tensor:
         return torch.zeros(self.program.count, like.length, dtype=torch.float64, device=HOST)

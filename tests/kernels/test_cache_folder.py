@@ -1,0 +1,136 @@
+"""Compiled sums are executed: they are kept where nobody but the user can write, or for this process only."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.kernels.reductions import keops
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="home folders are private here")
+as_root = pytest.mark.skipif(hasattr(os, "getuid") and os.getuid() != 0, reason="needs files of another user")
+NAME, STRANGER = "fused", 54321
+
+
+@pytest.fixture(autouse=True)
+def _new(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """As in a new process."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    _forget()
+    yield
+    _forget()
+
+
+def _forget() -> None:
+    for function in (keops._kept_folder, keops._passing_folder, keops._warned):
+        function.cache_clear()
+
+
+def kept(folder: Path) -> Path:
+    """The usual folder in a cache, made by an earlier process."""
+    own = folder / "diffeo_calib" / NAME
+    own.mkdir(parents=True)
+    (own / "code").write_bytes(b"compiled")
+    return own
+
+
+def passing(place: Path | str) -> None:
+    """Assert that this process has a folder of its own, and says so once."""
+    with pytest.warns(DiffeoCalibWarning, match="for this run only: '[^']*diffeo_calib' is no folder") as caught:
+        found = keops.cache_folder(NAME)
+    assert len(caught) == 1
+    assert str(place) in str(caught[0].message)
+    assert not list(found.iterdir())
+    assert stat.S_IMODE(found.stat().st_mode) == 0o700
+    assert keops.cache_folder(NAME) == found  # without a warning
+
+
+def test_the_users_folder_is_used_and_closed_to_others(tmp_path: Path) -> None:
+    own = kept(tmp_path / "cache")
+    own.chmod(0o755)
+    assert keops.cache_folder(NAME) == own
+    assert stat.S_IMODE(own.stat().st_mode) == 0o700
+
+
+def test_what_is_made_is_closed_to_others_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        (tmp_path / "cache").mkdir(mode=0o755)
+        folder = keops.cache_folder(NAME)
+    finally:
+        os.umask(before)
+    assert folder == tmp_path / "cache" / "diffeo_calib" / NAME
+    assert {stat.S_IMODE(one.stat().st_mode) for one in (folder, folder.parent)} == {0o700}
+
+
+def _writable(mode: int, levels: int) -> Callable[[Path], None]:
+    return lambda own: (own, *own.parents)[levels].chmod(mode)
+
+
+def _foreign(levels: int) -> Callable[[Path], None]:
+    return lambda own: os.chown((own / "code", own, *own.parents)[levels], STRANGER, -1)
+
+
+def _link_to_a_writable_folder(own: Path) -> None:
+    elsewhere = own.parents[2] / "elsewhere"
+    own.rename(elsewhere)
+    own.symlink_to(elsewhere)
+    elsewhere.chmod(0o777)
+
+
+UNSAFE = {
+    "writable by the group": _writable(0o775, 0),
+    "writable by all": _writable(0o777, 0),
+    "writable by all, sticky": _writable(0o1777, 0),
+    "a folder above it writable by the group": _writable(0o770, 1),
+    "the cache writable by all": _writable(0o777, 2),
+    "a link": _link_to_a_writable_folder,
+}
+FOREIGN = {"a file": _foreign(0), "the folder": _foreign(1), "a folder above it": _foreign(2), "the cache": _foreign(3)}
+
+
+@pytest.mark.parametrize("case", UNSAFE)
+def test_a_folder_that_others_can_write_to_is_not_used(case: str, tmp_path: Path) -> None:
+    UNSAFE[case](kept(tmp_path / "cache"))
+    passing(tmp_path)
+
+
+@as_root
+@pytest.mark.parametrize("case", FOREIGN)
+def test_what_belongs_to_another_user_is_not_used(case: str, tmp_path: Path) -> None:
+    FOREIGN[case](kept(tmp_path / "cache"))
+    passing(tmp_path)
+
+
+def test_a_shared_folder_that_keeps_files_of_their_owners_is_used(tmp_path: Path) -> None:
+    """As /tmp does."""
+    own = kept(tmp_path / "cache")
+    (tmp_path / "cache").chmod(0o1777)
+    assert keops.cache_folder(NAME) == own
+
+
+def test_a_link_to_a_folder_of_the_user_is_followed(tmp_path: Path) -> None:
+    own = kept(tmp_path / "elsewhere")
+    (tmp_path / "cache").symlink_to(tmp_path / "elsewhere")
+    assert keops.cache_folder(NAME) == own
+
+
+@pytest.mark.parametrize("home", ["", "relative"])
+def test_without_a_home_nothing_is_written_into_the_current_folder(
+    home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", home)
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative too")
+    passing("diffeo_calib")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("", encoding="utf-8")
+    passing(tmp_path)
