@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import DECISIONS, Entry, Sent, as_line
-from diffeo_calib.campaign.journal import GrowingTable, Journal, digest
+from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Sent, as_line, check_cells
+from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.planned import Next
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
@@ -19,10 +19,8 @@ from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 
-KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
-"""Fields of a verdict in a journal."""
-ID = "id"
-"""Column that tells rows apart."""
+LONGEST = 200
+"""Characters of an option in a journal; of longer ones it holds a hash."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +83,7 @@ class Live:
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
+        self._check_begun(next((one[BEGUN] for one in self.journal.entries if BEGUN in one), None))
         for line in lines[: len(known)]:
             self._keep(line)
         self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
@@ -99,6 +98,28 @@ class Live:
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
+
+    def _begun(self) -> dict[str, str]:
+        """What rows are read and judged with; of long texts their hashes."""
+        robot, source = self.campaign.robot, self.source
+        parts = robot.place_offsets, robot.axes, robot.coupling, robot.coupling_offset
+        numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
+        found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
+        found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
+        found |= {name: getattr(source, name) for name in ("position", "session", "sockets", "readings")}
+        found["joints"] = joint_columns(source.joints, robot)
+        texts = {name: str(value) for name, value in found.items() if value}
+        return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
+
+    def _check_begun(self, begun: dict[str, str] | None) -> None:
+        """Raise InputError unless the campaign was begun with the same."""
+        now = self._begun()
+        names = [] if begun is None else [name for name in begun | now if begun.get(name) != now.get(name)]
+        if begun is not None and names:
+            then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
+            fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
+            what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
+            raise InputError.of(what, expected=then, got=got, fix=fix)
 
     def new_lines(self) -> list[bytes]:
         """Lines that have not been judged."""
@@ -127,15 +148,16 @@ class Live:
 
     def take(self, sent: Sent) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
-        entry = {} if isinstance(sent.entry, DiffeoCalibError) else sent.entry
-        told = {ID: entry[ID]} if ID in entry else {}
+        told: Entry = {}
         try:
             if isinstance(sent.entry, DiffeoCalibError):
                 raise sent.entry
+            check_cells(entry := sent.entry)
+            told |= {ID: entry[ID]} if ID in entry else {}
             if "do" in entry:
                 self.decide(entry.get("line"), entry["do"])
             elif entry:
-                number = self.ids.get(str(entry.get(ID)))
+                number = self.known(entry)
                 told = self.answer(self._append(entry) if number is None else number) | told
             self.poll()
             told |= self.state()
@@ -144,13 +166,26 @@ class Live:
         self._say(told)
         sent.answer(told)
 
+    def known(self, row: Entry) -> int | None:
+        """Number of the line that a row repeats; InputError for other values under its id."""
+        if ID not in row:
+            return None
+        header, line = self.table.written(row)
+        number = self.ids.get(self.table.cells(line)[self.table.cells(header).index(ID)])
+        if number is not None and not self.table.same(line, self.lines[number]):
+            what = f"{ID} {row[ID]} is that of line {number + 2} of {self.source.csv}, whose values are others"
+            fix = "count on after those of the table when your program starts again, or leave ids out"
+            raise InputError.of(what, fix=fix)
+        return number
+
     def decide(self, line: object, what: object) -> None:
         """Do what a user decided about the rows of a line; InputError for no such line or decision."""
         if what not in DECISIONS:
             raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
         rows = [row for row, owner in enumerate(self.owner) if owner + 2 == line]
         if not rows:
-            expected = f"a line of {self.source.csv} with a row, 2 to {len(self.lines) + 1}"
+            numbers = f", 2 to {len(self.lines) + 1}" if self.lines else "; there is none yet"
+            expected = f"a line of {self.source.csv} with a row{numbers}"
             raise InputError.of("`line`", expected=expected, got=str(line))
         for row in rows:
             getattr(self.campaign, str(what))(row)
@@ -176,6 +211,7 @@ class Live:
     def _add(self, line: bytes) -> int:
         """Judge a line, and bring that to the disk; its number."""
         number = len(self.lines)
+        begun: list[Entry] = [] if number else [{BEGUN: self._begun()}]
         entry: Entry = {"line": number + 2, "sha": digest(line)}
         try:
             verdicts = self.campaign.add(self._read([line], first=number))
@@ -184,13 +220,13 @@ class Live:
         except DiffeoCalibError as error:
             entry["unreadable"] = self.unreadable[number] = str(error)
         self._keep(line)
-        self.journal.add([entry, *self._revised()])
+        self.journal.add([*begun, entry, *self._revised()])
         return number
 
     def _keep(self, line: bytes) -> None:
         self.lines.append(line)
         header, cells = self.table.cells(self.table.header), self.table.cells(line)
-        if ID in header and len(cells) == len(header):
+        if ID in header and len(cells) == len(header) and cells[header.index(ID)]:
             self.ids[cells[header.index(ID)]] = len(self.lines) - 1
 
     def _revised(self) -> Iterator[Entry]:
