@@ -198,21 +198,18 @@ class _Connection(StreamRequestHandler):
     def handle(self) -> None:
         self.server.note(self.connection, opened=True)
         try:
-            if not self.server.token or self._is_known():
-                self._ask({})
-                while text := self.rfile.readline(MOST_BYTES):
-                    self._ask(parsed(text))
-                self._write(self.server.last)
+            if self.server.token:
+                given = str(parsed(self.rfile.readline(MOST_BYTES)).get("token")).encode(errors="replace")
+                if not secrets.compare_digest(given, self.server.token.encode()):
+                    raise InputError.of("the first line", expected='{"token": "..."} with the token of the campaign')
+            self._ask({})
+            while text := self.rfile.readline(MOST_BYTES):
+                self._ask(parsed(text))
+            self._write(self.server.last)
         except InputError as error:
             self._write({"error": str(error)})
         finally:
             self.server.note(self.connection, opened=False)
-
-    def _is_known(self) -> bool:
-        given = str(parsed(self.rfile.readline(MOST_BYTES)).get("token"))
-        if not secrets.compare_digest(given.encode(errors="replace"), self.server.token.encode()):
-            raise InputError.of("the first line", expected='{"token": "..."} with the token of the campaign')
-        return True
 
     def _ask(self, entry: Entry) -> None:
         answers: SimpleQueue[Entry] = SimpleQueue()

@@ -23,6 +23,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from io import FileIO
+from itertools import chain, starmap
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -125,12 +126,13 @@ def _is_entry(entry: Any, lines: int, rows: int) -> bool:
     """Whether something is an entry of a journal after so many lines and rows."""
     match entry:
         case {"line": int(line), "sha": str(), "rows": [_, *_] as judged}:
-            fits = [isinstance(one, dict) and {"fits", "accepted"} <= {*one} and _is_kept(one) for one in judged]
-            return line == lines + 2 and len(entry) == 3 and all(fits)
+            whole = all(isinstance(one, dict) and {"fits", "accepted"} <= {*one} for one in judged)
+            good = whole and all(starmap(_is_field, chain.from_iterable(one.items() for one in judged)))
+            return line == lines + 2 and len(entry) == 3 and good
         case {"line": int(line), "sha": str(), "unreadable": str()}:
             return line == lines + 2 and len(entry) == 3
         case {"row": int(row), **changed}:
-            return 0 <= row < rows and _is_kept(changed)
+            return 0 <= row < rows and all(starmap(_is_field, changed.items()))
         case {"begun": dict(known)}:
             return len(entry) == 1 and all(isinstance(text, str) for text in known.values())
         case {"removed": str()}:
@@ -138,12 +140,8 @@ def _is_entry(entry: Any, lines: int, rows: int) -> bool:
     return False
 
 
-def _is_kept(fields: dict[str, object]) -> bool:
-    """Whether these are fields of a verdict."""
-    return all(_is_field(name, value) for name, value in fields.items())
-
-
 def _is_field(name: str, value: object) -> bool:
+    """Whether a field of a verdict can have a value."""
     match name, value:
         case ("fits", None) | ("fits" | "accepted" | "decided" | "again", bool()) | ("cause", str()):
             return True

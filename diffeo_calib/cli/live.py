@@ -15,24 +15,13 @@ from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, di
 from diffeo_calib.campaign.planned import Next
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """How a campaign prints.
-
-    Args:
-        poses: number of the next poses. lines: whether everything is said as JSON lines.
-    """
-
-    poses: int
-    lines: bool
 
 
 @dataclass
@@ -51,7 +40,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    shown: Shown
+    given: LiveOptions
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
@@ -69,7 +58,7 @@ class Live:
 
     def say(self, text: str, entry: Entry) -> None:
         """Print a text, or an entry as a line of JSON."""
-        if self.shown.lines:
+        if self.given.json_lines:
             sys.stdout.write(as_line(entry).decode())
             sys.stdout.flush()
         elif text:
@@ -141,7 +130,7 @@ class Live:
             return False
         self.journal.add(self._revised())
         self.late += self.revised
-        if not self.shown.lines:  # those who send rows as JSON lines get one answer for each
+        if not self.given.json_lines:  # those who send rows as JSON lines get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
         return True
@@ -266,7 +255,7 @@ class Live:
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
-        poses = [] if found is None else columns.joints_from_si(found.q[: self.shown.poses]).tolist()
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
         return entry | {"next": [dict(zip(names, q, strict=True)) for q in poses]}
 
     @property
@@ -274,22 +263,17 @@ class Live:
         """The next poses, and the forecast."""
         now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
-            self._found = now, self.campaign.next(max(self.shown.poses, 1))
+            self._found = now, self.campaign.next(max(self.given.next, 1))
         return self._found[1]
 
     @property
     def words(self) -> tuple[str, str]:
         """The expected error with the rows to the goal, and the next poses."""
         state = self.state()
-        more, known = state.get("more_rows", ""), state["expected_error_mm"]
+        more, known = state.get("more_rows", ""), expected(self.campaign)
         needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
-        first = "no model yet" if known is None else f"{_error(self.campaign)}{needed}"
-        return first, "; ".join(f"next: {pose}" for pose in poses)
-
-    def lines_of(self, rows: Sequence[int]) -> list[bytes]:
-        """The lines of some rows."""
-        return [self.lines[number] for number in dict.fromkeys(self.owner[row] for row in rows)]
+        return f"{known[2:]}{needed}" if known else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
 
     def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
         """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
@@ -305,10 +289,6 @@ class Live:
 
 def expected(campaign: Campaign) -> str:
     """The expected error in words, after a comma; empty without one."""
-    return "" if campaign.expected_error is None else f", {_error(campaign)}"
-
-
-def _error(campaign: Campaign) -> str:
-    """The expected error in words."""
-    limit, known = campaign.error_limit, 1e3 * (campaign.expected_error or 0.0)
-    return f"{known:.4g} mm expected" + ("" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)")
+    known, limit = campaign.expected_error, campaign.error_limit
+    below = "" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)"
+    return "" if known is None else f", {1e3 * known:.4g} mm expected{below}"

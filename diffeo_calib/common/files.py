@@ -217,19 +217,14 @@ def bring_to_disk(file: IO[bytes]) -> None:
 def _take_permissions(part: Path, target: Path) -> None:
     """Those of the existing file, and its owner where that is possible; of a new file the usual ones."""
     if not target.exists():
-        part.chmod(0o666 & ~_umask())
+        mask = os.umask(0o022)  # the mask can only be read by setting it
+        os.umask(mask)
+        part.chmod(0o666 & ~mask)  # mkstemp's files are readable by their owner only
         return
     known = target.stat()
     with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows
         os.chown(part, known.st_uid, known.st_gid)
     part.chmod(known.st_mode & 0o777)
-
-
-def _umask() -> int:
-    """Permissions that new files do not get; mkstemp's files are readable by their owner only."""
-    mask = os.umask(0o022)  # the mask can only be read by setting it
-    os.umask(mask)
-    return mask
 
 
 IMAGE_SUFFIXES = (".png", ".pdf", ".svg")

@@ -103,9 +103,8 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
         {"line": one.line, "text": str(one), "accepted": one.accepted, "fits": one.fits}
         for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
     ]
-    frames = robot.joint_frames(next_q)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(1, 0, 3)
-    tips = robot.tip_poses(next_q).flatten(1, -3)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(0, 1, 3)
-    q = next_q[:0] if campaign.table is None else campaign.table.q[-SHOWN_POSES:]
+    done_q = next_q[:0] if campaign.table is None else campaign.table.q[-SHOWN_POSES:]
+    next_tips, done = (robot.tip_poses(q)[:, 0, :3, 3].tolist() for q in (next_q, done_q))
     return {
         "error": None if known is None else 1e3 * known,
         "state": f"{len(campaign.accepted)} of {count} rows accepted; {words[0]}",
@@ -114,9 +113,9 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
         "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
         "forecast": steps,
         "verdicts": verdicts,
-        "done": robot.tip_poses(q).flatten(1, -3)[:, 0, :3, 3].tolist() if len(q) else [],
-        "next": tips[:, 0].tolist(),
-        "links": [*frames[0].tolist(), *tips[:, 0].tolist()],
+        "done": done,
+        "next": next_tips,
+        "links": robot.joint_frames(next_q)[:, :, :3, 3].flatten(0, 1).tolist() + next_tips,
     }
 
 

@@ -18,7 +18,7 @@ from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.commands.fit import RobotFile
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.live import Live, Shown, expected
+from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
@@ -47,7 +47,7 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
-        live = Live(campaign, source, links.tips, journal, Shown(given.next, given.json_lines))
+        live = Live(campaign, source, links.tips, journal, given)
         live.resume()
         inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
@@ -61,7 +61,8 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
         code = _followed(live, given, inbox, page)
         _end(live, listener)
     if given.accepted is not None:
-        write_whole(given.accepted, live.table.header + b"".join(live.lines_of(campaign.accepted)))
+        numbers = dict.fromkeys(live.owner[row] for row in campaign.accepted)
+        write_whole(given.accepted, live.table.header + b"".join(live.lines[number] for number in numbers))
     if code:
         raise typer.Exit(code)
 
