@@ -79,57 +79,37 @@ def test_a_second_writer_is_refused(tmp_path: Path) -> None:
         Journal(tmp_path / "run.journal")
 
 
-def no_journals() -> Iterator[bytes]:
-    """Files of others, and journals one entry of which is another."""
-    yield from (
-        b"text",
-        b"x,y\n1,2\n",
-        b"x,y\n1,2",
-        b'{"a": 1}\n',
-        b"[]\n",
-        bytes(9),
-        b"\xff\n",
-        b'{"begun": 1}\n',
-    )
-    yield from (b'{"begun": ' + 9999 * b"[", b'{"begun": ' + 9999 * b"[" + b"\n", b'{"line": 2}\n', b'{"removed": 1}\n')
-    whole = b"".join(as_line(one) for one in ENTRIES)
-    yield from (
-        whole + tail for tail in (b"text", b"text\n", b"7\n", b"null\n", b"\n", as_line(LINE), b'{"line": 3}\n')
-    )
-    for change in (
-        {"row": 1},
-        {"row": -1},
-        {"row": "0"},
-        {"row": 0, "line": 3},
-        {"row": 0, "other": 1},
-        {"row": 10**30},
-    ):
-        yield whole + as_line(change)
-    for change in (
-        {"line": "3"},
-        {"line": 4},
-        {"sha": 7},
-        {"sha": None},
-        {"rows": []},
-        {"rows": 7},
-        {"unreadable": "x"},
-    ):
-        yield whole + as_line({"line": 3, "sha": "0", "rows": [ROW]} | change)
-    others = [{"fits": 1}, {"accepted": None}, {"error": "x"}, {"error": -1.0}, {"error": 1e200}, {"cause": None}]
-    others += [{"shown": "mm"}, {"shown": ["mm"]}, {"shown": ["mm", "1"]}, {"decided": 0}, {"again": []}, {"row": 0}]
-    for change in others:
-        yield whole + as_line({"line": 3, "sha": "0", "rows": [ROW | change]})
-        yield whole + as_line({"row": 0} | (change if "row" not in change else {"fits": 0}))
-    yield whole + as_line({"line": 3, "sha": "0", "rows": [{"fits": True}]})
-    yield whole + b'{"row": 0, "error": 1e999}\n' + whole
-    yield whole + b'{"row": 0, "error": NaN}\n'
+def other_files() -> Iterator[bytes]:
+    """Files that are no journals."""
+    deep = b'{"begun": ' + 9999 * b"["
+    yield from (b"text", b"x,y\n1,2\n", b"x,y\n1,2", b'{"a": 1}\n', b"[]\n", bytes(9), b"\xff\n")
+    yield from (deep, deep + b"\n", b'{"begun": 1}\n', b'{"line": 2}\n', b'{"removed": 1}\n')
+
+
+def other_entries() -> Iterator[bytes]:
+    """What cannot follow the entries of a journal."""
+    yield from (b"text", b"text\n", b"7\n", b"null\n", b"\n", as_line(LINE), b'{"row": 0, "error": NaN}\n')
+    yield b'{"row": 0, "error": 1e999}\n'
+    for row in ({"row": 1}, {"row": -1}, {"row": "0"}, {"row": 10**30}, {"line": 3}, {"other": 1}, {"fits": 0}):
+        yield as_line({"row": 0} | row)
+    line = {"line": 3, "sha": "0", "rows": [ROW]}
+    for change in ({"line": "3"}, {"line": 4}, {"sha": 7}, {"rows": []}, {"rows": 7}, {"unreadable": "x"}):
+        yield as_line(line | change)
+    fields = [{"fits": 1}, {"accepted": None}, {"error": "x"}, {"error": -1.0}, {"error": 1e200}, {"cause": None}]
+    fields += [{"shown": "mm"}, {"shown": ["mm"]}, {"shown": ["mm", "1"]}, {"decided": 0}, {"again": []}]
+    for field in fields:
+        yield as_line(line | {"rows": [ROW | field]})
+        yield as_line({"row": 0} | field)
+    yield as_line(line | {"rows": [ROW | {"row": 0}]})
+    yield as_line(line | {"rows": [{"fits": True}]})
 
 
 def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
     """Also through a link."""
     path, link = tmp_path / "other", tmp_path / "run.csv.journal"
     link.symlink_to(path)
-    for content in no_journals():
+    whole = b"".join(as_line(one) for one in ENTRIES)
+    for content in [*other_files(), *(whole + tail for tail in other_entries())]:
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"not the journal of a campaign: got .*; name another table, or move"):
             Journal(link)

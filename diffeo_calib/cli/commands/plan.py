@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import isfinite, pi, radians
 from pathlib import Path
@@ -92,16 +92,21 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
-    if isinstance(source, CalibratedKinematics):
-        say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
-        for line in expectation_lines(source, None):
-            say(line)
+    for line in _lines_of_fit(source):
+        say(line)
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:
         say("its column `device`: what measures the pose")
         for line in [line for one in sensors for line in one.sentences()]:
             say(line)
+
+
+def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
+    """Expected error over the joint ranges of the fit, and why that of the plan differs."""
+    if isinstance(source, CalibratedKinematics):
+        yield "the table averages over the poses that were drawn or given; they may lie beyond those of the fit"
+        yield from expectation_lines(source, None)
 
 
 def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:
