@@ -316,7 +316,7 @@ def evenly_growing(effects: Tensor, order: Tensor) -> Tensor:
 def _drift(effects: Tensor, columns: Tensor, dense: CholeskyRegression, target: Tensor) -> ChangePoint:
     """The change from the first row to the last that explains most."""
     g, H = torch.einsum("imu,im->u", columns, dense.mu(target)), _normal(columns, dense)
-    u = _solved(H, g)
+    u = (torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g[..., None])[..., 0]  # noise-free rows leave H singular
     return ChangePoint(0, float(g @ u), u, effects)
 
 
@@ -335,11 +335,6 @@ def _ridge(H: Tensor) -> Tensor:
     """Ridge that keeps H (..., U, U) invertible where rows do not determine all unknowns."""
     level = RELATIVE_RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
     return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
-
-
-def _solved(H: Tensor, g: Tensor) -> Tensor:
-    """H^-1 g (..., U); noise-free rows may leave H singular even so."""
-    return (torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g[..., None])[..., 0]
 
 
 def causes_of(data: TangentData) -> list[Cause]:
