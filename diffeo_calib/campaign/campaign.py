@@ -138,7 +138,10 @@ class Campaign:
         Raises:
             InputError, MeasurementError: rows of another kind, or of other joints than those before.
         """
-        table = q_or_table if y is None else _positions(q_or_table, y)
+        table: Any = q_or_table
+        if y is not None:
+            q, points = (torch.as_tensor(value, dtype=torch.float64, device=HOST) for value in (q_or_table, y))
+            table = Measurements(torch.atleast_2d(q), points if q.ndim > 1 else points[None], doubt=False)
         check_arguments(self.robot, table, None)
         start = len(self)
         numbered, lines = self._numbered(table)
@@ -318,14 +321,6 @@ class Campaign:
         except DiffeoCalibError as error:  # a device that has no place yet
             row = len(table) - 1
             self.verdicts.append(Verdict(row, None, accepted=True, cause=str(error), line=self._lines[row]))
-
-
-def _positions(q: object, y: object) -> Measurements:
-    """Positions of one row or of several."""
-    joints, points = (torch.as_tensor(value, dtype=torch.float64, device=HOST) for value in (q, y))
-    if joints.ndim == 1:
-        joints, points = joints[None], points[None]
-    return Measurements(joints, points, doubt=False)
 
 
 def _joints(robot: Tree, values: object) -> Tensor:

@@ -19,8 +19,9 @@ no model. `more_rows`, `target_reached` and `error_limit_mm`, which the error ex
 decides, belong to a target. `change`: what changed before the row (`line`, `cause`, `others`, `size`, `unit`, `fix`);
 `revised`: earlier rows taken in or left out by this.
 
-`id` is optional: a number or a word that is a column of the table and tells rows apart. After a cut connection, a
-program sends the rows again that were not answered: a row whose id the table has is answered and not taken in again.
+`id` is optional: a number or a word that is a column of the table and tells rows apart; 1 and "1" are the same. After a
+cut connection, a program sends the rows again that were not answered: a row that the table has under its id is answered
+and not taken in again. Other numbers under an id that the table has are an error.
 
 Other objects: `{}` asks for the last seven of these alone; `{"do": "reject", "line": 5}` leaves a row out, "accept"
 takes it in, "repeat" leaves it out and puts its pose first among the next. A socket answers `{}` by itself when a
@@ -33,19 +34,24 @@ from __future__ import annotations
 import json
 import secrets
 import socket
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from queue import Queue, SimpleQueue
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 from threading import Event, Lock, Thread
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, as_written
 
 MOST_BYTES = 1 << 20
 """Of a line."""
 DECISIONS = ("accept", "reject", "repeat")
 """Decisions of a user on a row: methods of a campaign."""
+ID = "id"
+"""Column that tells rows apart."""
+LARGEST, LONGEST_WORD = 1e300, 200
+"""Number and characters of a cell."""
 LOCAL = ("127.0.0.1", "localhost")
 CLOSING_SECONDS = 2.0
 """For the last answers of a campaign."""
@@ -57,38 +63,80 @@ class Sent(NamedTuple):
     """An object that was sent, or why a line is none; and what takes the answer."""
 
     entry: Entry | DiffeoCalibError
-    answer: Callable[[Entry], object]
+    answer: Callable[[Entry], object] = str
 
 
 def parsed(text: bytes) -> Entry:
-    """The object of a line; InputError unless it is whole, and its values are numbers, words or null."""
+    """The object of a line; InputError unless it is whole."""
     try:
-        entry = json.loads(text, parse_constant=_refused) if text.endswith(b"\n") else None
+        entry = json.loads(text) if text.endswith(b"\n") else None
     except (ValueError, RecursionError):
         entry = None
-    if not isinstance(entry, dict) or not all(map(_is_cell, (*entry, *entry.values()))):
-        expected = "a JSON object of numbers, words and null that ends with a newline"
-        raise InputError.of("a line of JSON", expected=expected, got=repr(text[:60].decode(errors="replace")))
+    if not isinstance(entry, dict):
+        expected, got = "a JSON object that ends with a newline", repr(text[:60].decode(errors="replace"))
+        raise InputError.of("a line of JSON", expected=expected, got=got)
     return entry
 
 
-def _refused(text: str) -> None:
-    raise ValueError(text)
+def check_cells(entry: Entry) -> None:
+    """Raise InputError unless names and values fit into cells of a table, and an id is one."""
+    for name, value in entry.items():
+        word = isinstance(value, str) and len(value) <= LONGEST_WORD and value.isprintable()
+        size = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
+        if not (word or size or value is None) or len(name) > LONGEST_WORD or not name.isprintable():
+            expected = f"a finite number, a word of at most {LONGEST_WORD} characters, or null"
+            raise InputError.of(f"'{name}' of a row", expected=expected, got=as_written(value))
+    if not str(entry.get(ID, 0)).strip() or (ID in entry and entry[ID] is None):
+        fix = "leave it out where rows have none"
+        raise InputError.of(f"'{ID}' of a row", expected="a number or a word", got=json.dumps(entry[ID]), fix=fix)
 
 
-def _is_cell(value: object) -> bool:
-    """Whether a value fits into a cell of a table."""
-    return value is None or isinstance(value, int | float) or (isinstance(value, str) and value.isprintable())
-
-
-def read_lines(lines: Iterable[bytes], inbox: Queue[Sent | None], answer: Callable[[Entry], object]) -> None:
+def read_lines(lines: Iterable[bytes], inbox: Queue[Sent | None]) -> None:
     """Put what lines hold into an inbox, and None at their end; what is no object with the reason."""
     for text in lines:
         try:
-            inbox.put(Sent(parsed(text), answer))
+            inbox.put(Sent(parsed(text)))
         except InputError as error:
-            inbox.put(Sent(error, answer))
+            inbox.put(Sent(error))
     inbox.put(None)
+
+
+class Server(ThreadingTCPServer):
+    """A server whose connections have threads of their own."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def end(self) -> None:
+        """Let the connections go."""
+
+    def handle_error(self, *given: Any) -> None:
+        """A cut connection is no event: its rows are sent again."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(*given)
+
+
+SomeServer = TypeVar("SomeServer", bound=Server)
+
+
+@contextmanager
+def running(server: Callable[[tuple[str, int]], SomeServer], address: str, what: str) -> Iterator[SomeServer]:
+    """Run a server at ``PORT`` or ``HOST:PORT``, 0 for any free port; InputError where that is none, or taken."""
+    host, _, port = address.rpartition(":")
+    try:
+        made = server((host or LOCAL[0], int(port)))
+    except (OSError, ValueError, OverflowError) as error:
+        expected = "a free port, or HOST:PORT"
+        raise InputError.of(f"the {what} at {address}", expected=expected, got=str(error)) from error
+    thread = Thread(target=made.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield made
+    finally:
+        made.shutdown()
+        made.end()
+        made.server_close()
+        thread.join()
 
 
 @contextmanager
@@ -102,35 +150,19 @@ def listening(address: str, token: str, inbox: Queue[Sent | None]) -> Iterator[L
         InputError: another machine's address without a token, no such address, or one that is taken.
     """
     host, _, port = address.rpartition(":")
-    host = host or LOCAL[0]
-    if host not in LOCAL and not token:
+    if host not in ("", *LOCAL) and not token:
         fix = f"add a token, or listen at {LOCAL[0]}:{port}"
         raise InputError.of(f"other machines could send rows to {address}", expected="a token", got="none", fix=fix)
-    try:
-        server = Listener((host, int(port)), token, inbox)
-    except (OSError, ValueError, OverflowError) as error:
-        expected = "a free port, or HOST:PORT"
-        raise InputError.of(f"the socket at {address}", expected=expected, got=str(error)) from error
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
+    with running(lambda place: Listener(place, token, inbox), address, "socket") as server:
         yield server
-    finally:
-        server.shutdown()
-        server.end()
-        server.server_close()
-        thread.join()
 
 
-class Listener(ThreadingTCPServer):
+class Listener(Server):
     """A socket that rows come from.
 
     Attributes:
         address: HOST:PORT. last: what every connection is told at the end.
     """
-
-    daemon_threads = True
-    allow_reuse_address = True
 
     def __init__(self, place: tuple[str, int], token: str, inbox: Queue[Sent | None]) -> None:
         super().__init__(place, _Connection)
@@ -146,15 +178,16 @@ class Listener(ThreadingTCPServer):
             (self._none.clear if self._open else self._none.set)()
 
     def end(self) -> None:
-        """Read no more, and wait until the last answers are written."""
+        """Read no more, answer what was sent since, and wait until the last answers are written."""
         with self._lock:
             for connection in self._open:
                 with suppress(OSError):
                     connection.shutdown(socket.SHUT_RD)
+        while not self.inbox.empty():
+            sent = self.inbox.get()
+            if sent is not None:
+                sent.answer(self.last | {"error": "the campaign has ended; the row was not taken in"})
         self._none.wait(CLOSING_SECONDS)
-
-    def handle_error(self, *_: object) -> None:
-        """A cut connection is no event: its rows are sent again."""
 
 
 class _Connection(StreamRequestHandler):
@@ -165,21 +198,18 @@ class _Connection(StreamRequestHandler):
     def handle(self) -> None:
         self.server.note(self.connection, opened=True)
         try:
-            if not self.server.token or self._is_known():
-                self._ask({})
-                while text := self.rfile.readline(MOST_BYTES):
-                    self._ask(parsed(text))
-                self._write(self.server.last)
+            if self.server.token:
+                given = str(parsed(self.rfile.readline(MOST_BYTES)).get("token")).encode(errors="replace")
+                if not secrets.compare_digest(given, self.server.token.encode()):
+                    raise InputError.of("the first line", expected='{"token": "..."} with the token of the campaign')
+            self._ask({})
+            while text := self.rfile.readline(MOST_BYTES):
+                self._ask(parsed(text))
+            self._write(self.server.last)
         except InputError as error:
             self._write({"error": str(error)})
         finally:
             self.server.note(self.connection, opened=False)
-
-    def _is_known(self) -> bool:
-        given = str(parsed(self.rfile.readline(MOST_BYTES)).get("token"))
-        if not secrets.compare_digest(given.encode(), self.server.token.encode()):
-            raise InputError.of("the first line", expected='{"token": "..."} with the token of the campaign')
-        return True
 
     def _ask(self, entry: Entry) -> None:
         answers: SimpleQueue[Entry] = SimpleQueue()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
-from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales, noise_of_few, variance_ratio
+from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few, variance_ratio
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
@@ -23,9 +23,10 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.certainty import limit_of, scales_deviation
 from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
-from diffeo_calib.campaign.verdicts import LIMITS, Change, Measure, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import LIMITS, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.bodies import bodies_of
@@ -65,7 +66,7 @@ class CampaignModel:
         seen: rows of the campaign at that time. asked: candidates (M, n) and target (T, n), rad or m.
         posterior: of the accepted rows but the last ones. window: numbers of the last rows.
         last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
-        compared: see :func:`_compared`. ratios: of the squares of accepted rows, see :attr:`Measure.ratio`.
+        compared: see :func:`_compared`. ratios: of accepted rows, see :attr:`typical`.
         open: (M,) boolean, candidates that can be measured.
     """
 
@@ -118,8 +119,11 @@ class CampaignModel:
             if known is not None:
                 known = replace(known, lines=())
             chosen = choose_scales(data, rows, *stages, given=known, seed=seed)
-        if first:
-            _check_first(chosen)
+        ratio = variance_ratio(chosen.data, chosen.left_out) if first else 0.0
+        if ratio > SCALE_LIMITS.variance_ratio:  # around wrong places all later rows would be wrong
+            expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
+            fix = "measure more rows, then the model is made"
+            raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
         found, data = chosen.selection.scales, chosen.data
         later: Any = None
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
@@ -226,11 +230,14 @@ class CampaignModel:
         found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
         fits = found.fits(typical)
         if fits:
-            self.ratios.append(found.ratio)
+            self.ratios.append(found.square / chi2_above(1.0 - LIMITS.typical_share, found.freedom))
         cause = "" if fits else self._cause(table, around.data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        change = None if cause else self._change(around, seen, verdicts, found, typical)
+        own = [verdicts[number] for number in self.window]
+        flags = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
+        how: Any = {"single": found, "typical": typical}
+        change = None if cause else find_change(seen, self.window, around.causes(), flags, **how)
         if change is not None:
             change = replace(change, line=lines[change.row])
             for number in self.window:
@@ -242,7 +249,7 @@ class CampaignModel:
 
     @property
     def typical(self) -> float:
-        """How large right squares are relative to those by chance: at least one."""
+        """How large right squares are relative to what chance exceeds in a share of the rows: at least one."""
         last = sorted(self.ratios[-LIMITS.typical_rows :])
         if len(last) < LIMITS.fewest_typical:
             return LIMITS.at_first
@@ -259,14 +266,6 @@ class CampaignModel:
         if bool(self.taken[0]):
             self.last = self.posterior.take(row, self.last)
         self.window, self.taken = self.window[1:], self.taken[1:]
-
-    def _change(
-        self, around: Around, seen: Seen, verdicts: Sequence[Verdict], single: Measure, typical: float
-    ) -> Change | None:
-        """Change found among the last rows."""
-        own = [verdicts[number] for number in self.window]
-        known, doubted = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        return find_change(seen, self.window, around.causes(), (known, doubted), single=single, typical=typical)
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -347,15 +346,6 @@ class CampaignModel:
         c = 0 if self.data.shared is None else self.data.shared.shape[2]
         nothing, seen = q.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
         return Rows(at, q.new_zeros(count, m, c), q.new_zeros(count, m, m), nothing, seen)
-
-
-def _check_first(chosen: ChosenScales) -> None:
-    """MeasurementError for few rows that contradict each other: around wrong places all later rows would be wrong."""
-    ratio = variance_ratio(chosen.data, chosen.left_out)
-    if ratio > SCALE_LIMITS.variance_ratio:
-        expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
-        fix = "measure more rows, then the model is made"
-        raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
 
 
 def with_joints(table: Any, q: Tensor) -> Any:

@@ -133,27 +133,21 @@ class Factor:
     """
 
     def __init__(self, covariance: Tensor) -> None:
-        self._low, self._count = cholesky(covariance), 0
-        self._appended = covariance.new_zeros(0, len(covariance))  # (room, n + room): below and corner
+        self._low = cholesky(covariance)
+        self._below, self._corner = covariance.new_zeros(0, len(covariance)), covariance.new_zeros(0, 0)
 
     def solved(self, values: Tensor) -> Tensor:
         """L^-1 values (S, R)."""
-        n, k = len(self._low), self._count
+        n = len(self._low)
         top = torch.linalg.solve_triangular(self._low, values[:n], upper=False)
-        if not k:
-            return top
-        rest = values[n:] - self._appended[:k, :n] @ top
-        return torch.cat([top, torch.linalg.solve_triangular(self._appended[:k, n : n + k], rest, upper=False)])
+        rest = values[n:] - self._below @ top
+        return torch.cat([top, torch.linalg.solve_triangular(self._corner, rest, upper=False)])
 
     def append(self, white: Tensor, low: Tensor) -> None:
         """Append R rows: V (S, R), and the factor (R, R) of their covariance by those before."""
-        n, k, size = len(self._low), self._count, len(white)
-        self._count += len(low)
-        if self._count > len(self._appended):
-            old, self._appended = self._appended, low.new_zeros(2 * self._count, n + 2 * self._count)
-            self._appended[: len(old), : old.shape[1]] = old
-        self._appended[k : self._count, :size] = white.T
-        self._appended[k : self._count, size : size + len(low)] = low
+        n, right = len(self._low), low.new_zeros(len(self._corner), len(low))
+        self._below = torch.cat([self._below, white[:n].T])
+        self._corner = torch.cat([torch.cat([self._corner, right], 1), torch.cat([white[n:].T, low], 1)])
 
 
 class Posterior:
@@ -170,14 +164,14 @@ class Posterior:
         self.rows, self.asked = rows, asked
         self._factor = Factor(rows.covariance(rows) + rows.noises)
         self._values = self._factor.solved(rows.values[:, None])[:, 0]
-        self._of_asked = Growing(self._factor.solved(self._with_asked(rows)))
-        self.known = torch.cat([self._with_asked(one) for one in asked]) - self._of_asked.rows.T @ self._of_asked.rows
+        self._of_asked = self._factor.solved(self._with_asked(rows))
+        self.known = torch.cat([self._with_asked(one) for one in asked]) - self._of_asked.T @ self._of_asked
 
     def see(self, rows: Rows) -> Seen:
         """Rows as they are predicted."""
         V = self._factor.solved(self.rows.covariance(rows))
         covariance = rows.covariance(rows) + rows.noises - V.T @ V
-        asked = self._with_asked(rows) - V.T @ self._of_asked.rows
+        asked = self._with_asked(rows) - V.T @ self._of_asked
         return Seen(rows, V, rows.values - V.T @ self._values, covariance, asked)
 
     def take(self, seen: Seen, later: Seen) -> Seen:
@@ -189,7 +183,7 @@ class Posterior:
         )
         self._factor.append(seen.white, low)
         self._values = torch.cat([self._values, values[:, 0]])
-        self._of_asked.append(asked)
+        self._of_asked = torch.cat([self._of_asked, asked])
         self.known = self.known - asked.T @ asked
         self.rows = Rows.joined(self.rows, seen.rows)
         return Seen(
@@ -205,27 +199,6 @@ class Posterior:
         return torch.cat([rows.covariance(one) for one in self.asked], 1)
 
 
-class Growing:
-    """Rows of a matrix to which others are appended, mostly without a copy."""
-
-    def __init__(self, rows: Tensor) -> None:
-        self._room, self._count = rows, 0
-        self.append(rows)
-
-    @property
-    def rows(self) -> Tensor:
-        """(S, Z) all of them."""
-        return self._room[: self._count]
-
-    def append(self, rows: Tensor) -> None:
-        """Append some (R, Z)."""
-        start, self._count = self._count, self._count + len(rows)
-        if self._count > len(self._room) or not start:
-            old, self._room = self._room, rows.new_empty(2 * self._count, rows.shape[1])
-            self._room[:start] = old[:start]
-        self._room[start : self._count] = rows
-
-
 def cholesky(matrix: Tensor) -> Tensor:
     """The lower factor; NumericalError unless a covariance is positive definite."""
     factor, info = torch.linalg.cholesky_ex(0.5 * (matrix + matrix.T))
@@ -234,15 +207,8 @@ def cholesky(matrix: Tensor) -> Tensor:
     return factor
 
 
-class Part(NamedTuple):
-    """Errors and their covariance given others: e (R,), m; S (R, R), m^2."""
-
-    error: Tensor
-    covariance: Tensor
-
-
-def given(error: Tensor, covariance: Tensor, wanted: Tensor, known: Tensor) -> Part:
-    """Some numbers of a Gaussian given others: masks (R,) of both."""
+def given(error: Tensor, covariance: Tensor, wanted: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors, m, and covariance, m^2, of some numbers of a Gaussian given others: masks (R,) of both."""
     cross = covariance[wanted][:, known]
     gain = torch.linalg.solve(covariance[known][:, known], cross.T).T if bool(known.any()) else cross
-    return Part(error[wanted] - gain @ error[known], covariance[wanted][:, wanted] - gain @ cross.T)
+    return error[wanted] - gain @ error[known], covariance[wanted][:, wanted] - gain @ cross.T

@@ -145,11 +145,6 @@ class Measure(NamedTuple):
         """Whether chance explains it; ``typical``: size of right squares relative to chi-squared."""
         return self.square <= typical * chi2_above(chance, self.freedom)
 
-    @property
-    def ratio(self) -> float:
-        """d^2 relative to that which chance exceeds in as many rows as :attr:`JudgementLimits.typical_share` leaves."""
-        return self.square / chi2_above(1.0 - LIMITS.typical_share, self.freedom)
-
 
 def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | None = None) -> Measure:
     """The distance of a row from what accepted rows and some others say.
@@ -160,10 +155,10 @@ def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | No
     """
     owner = seen.rows.owner
     wanted = (owner == row) if some is None else some & (owner == row)
-    part = given(seen.error, seen.covariance, wanted, known[owner] & (owner != row))
-    square = float(part.error @ torch.linalg.solve(part.covariance, part.error))
-    expected = float(part.covariance.diagonal().mean().clamp(min=0).sqrt())
-    return Measure(square, freedom, float(part.error.square().mean().sqrt()), expected)
+    error, covariance = given(seen.error, seen.covariance, wanted, known[owner] & (owner != row))
+    square = float(error @ torch.linalg.solve(covariance, error))
+    expected = float(covariance.diagonal().mean().clamp(min=0).sqrt())
+    return Measure(square, freedom, float(error.square().mean().sqrt()), expected)
 
 
 def exchanged(y: Tensor, bodies: int) -> Iterator[tuple[str, Tensor]]:
@@ -199,8 +194,8 @@ def find_change(
     effects = torch.cat([cause.effects for cause in causes], 2).flatten(0, 1)[seen.rows.visible.flatten()]
     for first in range(len(numbers) - limits.fewest_rows + 1):
         after = (owner >= first) & doubted[owner]
-        part = given(seen.error, seen.covariance, after, (owner < first) & known[owner])
-        low, whole = torch.linalg.cholesky(part.covariance), torch.cat([part.error[:, None], effects[after]], 1)
+        error, covariance = given(seen.error, seen.covariance, after, (owner < first) & known[owner])
+        low, whole = torch.linalg.cholesky(covariance), torch.cat([error[:, None], effects[after]], 1)
         error, *each = torch.linalg.solve_triangular(low, whole, upper=False).split([1, *sizes], 1)
         white = error[:, 0]
         for cause, B, columns in zip(causes, effects[after].split(sizes, 1), each, strict=True):

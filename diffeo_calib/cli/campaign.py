@@ -89,12 +89,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _words(path: Path, name: str, value: object) -> list[str]:
     """One entry as words of a command line."""
-    if name == "csv":
-        return []
-    option = "--" + name
-    if isinstance(value, bool):
-        return [option] if value else []
-    values = value if isinstance(value, list) else [value]
+    option, values = "--" + name, value if isinstance(value, list) else [value]
+    if name == "csv" or isinstance(value, bool):
+        return [option] if value is True else []
     if name not in REPEATED and isinstance(value, list):
         values = [",".join(map(str, value))]
     return [word for one in values for word in (option, _text(path, name, one))]

@@ -10,31 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import DECISIONS, Entry, Sent, as_line
-from diffeo_calib.campaign.journal import GrowingTable, Journal, digest
+from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Sent, as_line, check_cells
+from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.planned import Next
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 
-KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
-"""Fields of a verdict in a journal."""
-ID = "id"
-"""Column that tells rows apart."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """How a campaign prints.
-
-    Args:
-        poses: number of the next poses. lines: whether everything is said as JSON lines.
-    """
-
-    poses: int
-    lines: bool
+LONGEST = 200
+"""Characters of an option in a journal; of longer ones it holds a hash."""
 
 
 @dataclass
@@ -53,7 +40,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    shown: Shown
+    given: LiveOptions
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
@@ -71,7 +58,7 @@ class Live:
 
     def say(self, text: str, entry: Entry) -> None:
         """Print a text, or an entry as a line of JSON."""
-        if self.shown.lines:
+        if self.given.json_lines:
             sys.stdout.write(as_line(entry).decode())
             sys.stdout.flush()
         elif text:
@@ -85,6 +72,7 @@ class Live:
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
+        self._check_begun(next((one[BEGUN] for one in self.journal.entries if BEGUN in one), None))
         for line in lines[: len(known)]:
             self._keep(line)
         self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
@@ -99,6 +87,28 @@ class Live:
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
+
+    def _begun(self) -> dict[str, str]:
+        """What rows are read and judged with; of long texts their hashes."""
+        robot, source = self.campaign.robot, self.source
+        parts = robot.place_offsets, robot.axes, robot.coupling, robot.coupling_offset
+        numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
+        found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
+        found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
+        found |= {name: getattr(source, name) for name in ("position", "session", "sockets", "readings")}
+        found["joints"] = joint_columns(source.joints, robot)
+        texts = {name: str(value) for name, value in found.items() if value}
+        return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
+
+    def _check_begun(self, begun: dict[str, str] | None) -> None:
+        """Raise InputError unless the campaign was begun with the same."""
+        now = self._begun()
+        names = [] if begun is None else [name for name in begun | now if begun.get(name) != now.get(name)]
+        if begun is not None and names:
+            then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
+            fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
+            what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
+            raise InputError.of(what, expected=then, got=got, fix=fix)
 
     def new_lines(self) -> list[bytes]:
         """Lines that have not been judged."""
@@ -120,22 +130,23 @@ class Live:
             return False
         self.journal.add(self._revised())
         self.late += self.revised
-        if not self.shown.lines:  # those who send rows as JSON lines get one answer for each
+        if not self.given.json_lines:  # those who send rows as JSON lines get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
         return True
 
     def take(self, sent: Sent) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
-        entry = {} if isinstance(sent.entry, DiffeoCalibError) else sent.entry
-        told = {ID: entry[ID]} if ID in entry else {}
+        told: Entry = {}
         try:
             if isinstance(sent.entry, DiffeoCalibError):
                 raise sent.entry
+            check_cells(entry := sent.entry)
+            told |= {ID: entry[ID]} if ID in entry else {}
             if "do" in entry:
                 self.decide(entry.get("line"), entry["do"])
             elif entry:
-                number = self.ids.get(str(entry.get(ID)))
+                number = self.known(entry)
                 told = self.answer(self._append(entry) if number is None else number) | told
             self.poll()
             told |= self.state()
@@ -144,13 +155,26 @@ class Live:
         self._say(told)
         sent.answer(told)
 
+    def known(self, row: Entry) -> int | None:
+        """Number of the line that a row repeats; InputError for other values under its id."""
+        if ID not in row:
+            return None
+        header, line = self.table.written(row)
+        number = self.ids.get(self.table.cells(line)[self.table.cells(header).index(ID)])
+        if number is not None and not self.table.same(line, self.lines[number]):
+            what = f"{ID} {row[ID]} is that of line {number + 2} of {self.source.csv}, whose values are others"
+            fix = "count on after those of the table when your program starts again, or leave ids out"
+            raise InputError.of(what, fix=fix)
+        return number
+
     def decide(self, line: object, what: object) -> None:
         """Do what a user decided about the rows of a line; InputError for no such line or decision."""
         if what not in DECISIONS:
             raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
         rows = [row for row, owner in enumerate(self.owner) if owner + 2 == line]
         if not rows:
-            expected = f"a line of {self.source.csv} with a row, 2 to {len(self.lines) + 1}"
+            numbers = f", 2 to {len(self.lines) + 1}" if self.lines else "; there is none yet"
+            expected = f"a line of {self.source.csv} with a row{numbers}"
             raise InputError.of("`line`", expected=expected, got=str(line))
         for row in rows:
             getattr(self.campaign, str(what))(row)
@@ -176,6 +200,7 @@ class Live:
     def _add(self, line: bytes) -> int:
         """Judge a line, and bring that to the disk; its number."""
         number = len(self.lines)
+        begun: list[Entry] = [] if number else [{BEGUN: self._begun()}]
         entry: Entry = {"line": number + 2, "sha": digest(line)}
         try:
             verdicts = self.campaign.add(self._read([line], first=number))
@@ -184,13 +209,13 @@ class Live:
         except DiffeoCalibError as error:
             entry["unreadable"] = self.unreadable[number] = str(error)
         self._keep(line)
-        self.journal.add([entry, *self._revised()])
+        self.journal.add([*begun, entry, *self._revised()])
         return number
 
     def _keep(self, line: bytes) -> None:
         self.lines.append(line)
         header, cells = self.table.cells(self.table.header), self.table.cells(line)
-        if ID in header and len(cells) == len(header):
+        if ID in header and len(cells) == len(header) and cells[header.index(ID)]:
             self.ids[cells[header.index(ID)]] = len(self.lines) - 1
 
     def _revised(self) -> Iterator[Entry]:
@@ -230,7 +255,7 @@ class Live:
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
-        poses = [] if found is None else columns.joints_from_si(found.q[: self.shown.poses]).tolist()
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
         return entry | {"next": [dict(zip(names, q, strict=True)) for q in poses]}
 
     @property
@@ -238,22 +263,17 @@ class Live:
         """The next poses, and the forecast."""
         now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
-            self._found = now, self.campaign.next(max(self.shown.poses, 1))
+            self._found = now, self.campaign.next(max(self.given.next, 1))
         return self._found[1]
 
     @property
     def words(self) -> tuple[str, str]:
         """The expected error with the rows to the goal, and the next poses."""
         state = self.state()
-        more, known = state.get("more_rows", ""), state["expected_error_mm"]
+        more, known = state.get("more_rows", ""), expected(self.campaign)
         needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
-        first = "no model yet" if known is None else f"{_error(self.campaign)}{needed}"
-        return first, "; ".join(f"next: {pose}" for pose in poses)
-
-    def lines_of(self, rows: Sequence[int]) -> list[bytes]:
-        """The lines of some rows."""
-        return [self.lines[number] for number in dict.fromkeys(self.owner[row] for row in rows)]
+        return f"{known[2:]}{needed}" if known else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
 
     def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
         """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
@@ -269,10 +289,6 @@ class Live:
 
 def expected(campaign: Campaign) -> str:
     """The expected error in words, after a comma; empty without one."""
-    return "" if campaign.expected_error is None else f", {_error(campaign)}"
-
-
-def _error(campaign: Campaign) -> str:
-    """The expected error in words."""
-    limit, known = campaign.error_limit, 1e3 * (campaign.expected_error or 0.0)
-    return f"{known:.4g} mm expected" + ("" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)")
+    known, limit = campaign.expected_error, campaign.error_limit
+    below = "" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)"
+    return "" if known is None else f", {1e3 * known:.4g} mm expected{below}"

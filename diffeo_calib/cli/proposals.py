@@ -98,7 +98,8 @@ class RowColumns:
             yield "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
         if self.readings:
             why = "by names; `displacement` is a distance with an unknown zero"
-            why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels" * self.lens_missing
+            if any(text.endswith(LENS) for text in self.readings):
+                why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
             sizes = self.of_boards and not self.readings[0].endswith(".yaml")
             why += "; width and height of the images are the least usual size that holds all corners" * sizes
             yield "reading", self.readings[0] if len(self.readings) == 1 else self.readings, why
@@ -110,11 +111,6 @@ class RowColumns:
             yield "payload", self.payload, "by its name: the known mass that the robot carried"
         for option, column in self.covariates.items():
             yield option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
-
-    @property
-    def lens_missing(self) -> bool:
-        """Whether the user is to fill in what no table holds."""
-        return any(text.endswith(LENS) for text in self.readings)
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:

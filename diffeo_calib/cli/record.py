@@ -200,7 +200,9 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path], *, m
     for option, path in named.items():
         _check(option, path, taken)
         taken[option] = path
-    check_figure(outputs.get("--figure"))
+    figure = outputs.get("--figure")
+    if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
+        raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
     for name, path in inputs.items():
         if name != may_come and not os.path.lexists(path):
             kind = "model file" if name in ("MODEL", "OLD") else "file"
@@ -213,18 +215,14 @@ def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
         return
     try:
         _check_place(option, path)
-        _check_apart(option, path, taken)
+        for name, other in taken.items():
+            same = path.exists() and other.exists() and path.samefile(other)
+            if same or os.path.realpath(path) == os.path.realpath(other):
+                raise InputError.of(f"{option} {path} is the file of {name}", fix="name another file")
     except OSError as error:
         what = f"{option} {path} cannot be written ({error.strerror})"
         raise InputError.of(what, fix="name another file") from error
     check_writable(path)
-
-
-def check_figure(figure: Path | None) -> Path | None:
-    """The file of a figure; InputError for an unknown format of images."""
-    if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
-        raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
-    return figure
 
 
 def make_folder(folder: Path) -> None:
@@ -246,10 +244,3 @@ def _check_place(option: str, path: Path) -> None:
     if path.exists() and not os.access(path, os.W_OK):
         what = f"{option} {path} cannot be written: permission denied"
         raise InputError.of(what, fix="name a file in a folder that you may write to")
-
-
-def _check_apart(option: str, path: Path, taken: dict[str, Path]) -> None:
-    for name, other in taken.items():
-        same = path.exists() and other.exists() and path.samefile(other)
-        if same or os.path.realpath(path) == os.path.realpath(other):
-            raise InputError.of(f"{option} {path} is the file of {name}", fix="name another file")

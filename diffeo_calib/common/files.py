@@ -87,7 +87,7 @@ class WholeFile:
         with _one_sentence(self.path):
             self._opened.flush()
             if self._part is not None:
-                os.fsync(self._opened.fileno())  # some file systems notice only now that they are full
+                bring_to_disk(self._opened)  # some file systems notice only now that they are full
                 _take_permissions(self._part, self._target)
 
     def abandon(self) -> None:
@@ -118,7 +118,7 @@ class WholeFile:
         while True:
             handle, name = tempfile.mkstemp(dir=self._target.parent, prefix=f"{_stem(self._target)}.", suffix=SUFFIX)
             lock = self._stack.enter_context(os.fdopen(handle, "wb"))
-            _lock(lock, wait=True)
+            lock_file(lock, wait=True)
             if Path(name).exists():  # otherwise another writer took it for a leftover, before it was locked
                 break
         self._part = Path(name)
@@ -205,33 +205,42 @@ def _stem(target: Path) -> str:
 
 def _remove_leftovers(target: Path) -> None:
     """Remove temporary files of the same target that no living process has locked."""
-    if fcntl is None:
-        return
     ours = re.compile(re.escape(f"{_stem(target)}.") + r"[a-z0-9_]{8}" + re.escape(SUFFIX))
     for name in os.listdir(target.parent):
         if ours.fullmatch(name):
             with suppress(OSError), (target.parent / name).open("rb+") as file:  # it may be another user's
-                if _lock(file, wait=False):
+                if lock_file(file, wait=False):
                     os.unlink(file.name)
 
 
-def _lock(file: IO[bytes], *, wait: bool) -> bool:
-    """Lock an open file for this process; False where the file system has no locks or another process holds one."""
-    if fcntl is None:
-        return False
+def lock_file(file: IO[bytes], *, wait: bool) -> bool | None:
+    """Lock an open file for this process; False if another one holds it, None where there are no locks."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            return True
+    except BlockingIOError:
         return False
-    return True
+    except OSError:  # some file systems
+        pass
+    return None
+
+
+def bring_to_disk(file: IO[bytes]) -> None:
+    """Bring a flushed file to the disk, where its file system knows how."""
+    try:
+        os.fsync(file.fileno())
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):
+            raise
 
 
 def _take_permissions(part: Path, target: Path) -> None:
     """Those of the existing file, and its owner where that is possible; of a new file the usual ones."""
     if not target.exists():
-        mask = os.umask(0o022)  # it can only be read by setting it
+        mask = os.umask(0o022)  # the mask can only be read by setting it
         os.umask(mask)
-        part.chmod(0o666 & ~mask)
+        part.chmod(0o666 & ~mask)  # mkstemp's files are readable by their owner only
         return
     known = target.stat()
     with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows

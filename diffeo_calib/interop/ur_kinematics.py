@@ -75,16 +75,11 @@ def write_ur_kinematics(
         InputError: the model does not hold its URDF and ``robot`` is missing, a hash that is not one word, or the file
             cannot be written.
     """
-    check_hash(hash)
-    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
-    write_whole(path, ur_text(ur_transforms(geometry, urdf_of(geometry.chain, robot)), hash).encode())
-
-
-def check_hash(hash: str | None) -> None:
-    """Raise InputError for a hash that is no plain word in YAML."""
     if hash is not None and not re.fullmatch(r"[A-Za-z]\w*", hash, re.ASCII):
         expected, fix = "letters, digits and _", "copy the entry hash of the robot's own calibration file: calib_..."
         raise InputError.of("`hash`", expected=expected, got=as_written(hash), fix=fix)
+    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+    write_whole(path, ur_text(ur_transforms(geometry, urdf_of(geometry.chain, robot)), hash).encode())
 
 
 def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:

@@ -129,7 +129,10 @@ def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) 
 
 def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes (G,) of the groups, and their numbers (G,) in random order."""
-    checked_seed = _seed(seed)
+    try:
+        checked_seed = check_seed(seed)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
         together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
@@ -137,13 +140,6 @@ def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> t
         fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
         raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
     return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))
-
-
-def _seed(seed: object) -> int:
-    try:
-        return check_seed(seed)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
 
 
 @methods_outside_inference_mode

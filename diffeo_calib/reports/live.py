@@ -11,20 +11,20 @@ browsers send across origins only after asking.
 from __future__ import annotations
 
 import json
+import re
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import AbstractContextManager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.resources import files
 from queue import Queue
-from threading import Condition, Thread
+from threading import Condition
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import DECISIONS, LOCAL, Sent
+from diffeo_calib.campaign.feeds import DECISIONS, LOCAL, Sent, Server, running
 from diffeo_calib.campaign.planned import Next
-from diffeo_calib.common.errors import InputError
 
 PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500
@@ -32,9 +32,11 @@ SHOWN_ROWS, SHOWN_POSES = 8, 500
 ALIVE_SECONDS = 10.0
 """After this long without news, the page receives a sign of life; closed ones are noticed then."""
 HEADER = "X-Campaign"
+LINE = re.compile("[0-9]{1,9}")
+"""The number of a line."""
 
 
-class Page:
+class Page(Server, HTTPServer):
     """A running server.
 
     Attributes:
@@ -42,9 +44,11 @@ class Page:
         decisions: what the buttons decided, as programs send it.
     """
 
-    def __init__(self, server: ThreadingHTTPServer, token: str, decisions: Queue[Sent | None]) -> None:
-        host, port = str(server.server_address[0]), server.server_address[1]
-        self.token, self.url = token, f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+    def __init__(self, place: tuple[str, int], decisions: Queue[Sent | None]) -> None:
+        super().__init__(place, _Handler)
+        host, port = str(self.server_address[0]), self.server_address[1]
+        self.token = "" if place[0] in LOCAL else secrets.token_urlsafe()
+        self.url = f"http://{host}:{port}/" + (f"?token={self.token}" if self.token else "")
         self.decisions = decisions
         self._news, self._state, self._count, self.closed = Condition(), "{}", 0, False
 
@@ -54,7 +58,7 @@ class Page:
             self._state, self._count = json.dumps(state), self._count + 1
             self._news.notify_all()
 
-    def close(self) -> None:
+    def end(self) -> None:
         """Let all pages go."""
         with self._news:
             self.closed = True
@@ -73,8 +77,7 @@ class Page:
             yield text
 
 
-@contextmanager
-def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
+def served(address: str, decisions: Queue[Sent | None]) -> AbstractContextManager[Page]:
     """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
 
     Args:
@@ -83,25 +86,7 @@ def served(address: str, decisions: Queue[Sent | None]) -> Iterator[Page]:
     Raises:
         InputError: no such address, or one that is taken.
     """
-    host, _, port = address.rpartition(":")
-    host = host or LOCAL[0]
-    try:
-        server = ThreadingHTTPServer((host, int(port)), _Handler)
-    except (OSError, ValueError, OverflowError) as error:
-        expected = "a free port, or HOST:PORT"
-        raise InputError.of(f"the page at {address}", expected=expected, got=str(error)) from error
-    server.daemon_threads = True
-    page = Page(server, "" if host in LOCAL else secrets.token_urlsafe(), decisions)
-    vars(server)["page"] = page
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield page
-    finally:
-        page.close()
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    return running(lambda place: Page(place, decisions), address, "page")
 
 
 def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> dict[str, Any]:
@@ -118,9 +103,8 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
         {"line": one.line, "text": str(one), "accepted": one.accepted, "fits": one.fits}
         for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
     ]
-    frames = robot.joint_frames(next_q)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(1, 0, 3)
-    tips = robot.tip_poses(next_q).flatten(1, -3)[:, :, :3, 3] if len(next_q) else next_q.new_zeros(0, 1, 3)
-    done = robot.tip_poses(campaign.table.q[-SHOWN_POSES:]).flatten(1, -3)[:, 0, :3, 3]
+    done_q = next_q[:0] if campaign.table is None else campaign.table.q[-SHOWN_POSES:]
+    next_tips, done = (robot.tip_poses(q)[:, 0, :3, 3].tolist() for q in (next_q, done_q))
     return {
         "error": None if known is None else 1e3 * known,
         "state": f"{len(campaign.accepted)} of {count} rows accepted; {words[0]}",
@@ -129,22 +113,32 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
         "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
         "forecast": steps,
         "verdicts": verdicts,
-        "done": done.tolist(),
-        "next": tips[:, 0].tolist(),
-        "links": [*frames[0].tolist(), *tips[:, 0].tolist()],
+        "done": done,
+        "next": next_tips,
+        "links": robot.joint_frames(next_q)[:, :, :3, 3].flatten(0, 1).tolist() + next_tips,
     }
 
 
 class _Handler(BaseHTTPRequestHandler):
     """Answers the page's requests."""
 
-    @property
-    def page(self) -> Page:
-        return vars(self.server)["page"]
+    server: Page
+
+    def parse_request(self) -> bool:
+        """Split the path too; 400 where that is impossible."""
+        if not super().parse_request():
+            return False
+        try:
+            self._parts = urlsplit(self.path)
+        except ValueError:
+            self.send_error(400)
+            return False
+        self._query = parse_qs(self._parts.query)
+        return True
 
     def do_GET(self) -> None:
         """The page, or its events."""
-        path = urlsplit(self.path).path
+        path = self._parts.path
         if not self._allowed():
             self.send_error(403)
         elif path == "/":
@@ -152,23 +146,23 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(files("diffeo_calib.reports.html").joinpath("live.html").read_bytes())
         elif path == "/events":
             self._begin("text/event-stream")
-            with suppress(OSError):  # the page was closed
-                for text in self.page.states():
-                    self.wfile.write(f"data: {text}\n\n".encode() if text else b": alive\n\n")
-                    self.wfile.flush()
+            for text in self.server.states():
+                self.wfile.write(f"data: {text}\n\n".encode() if text else b": alive\n\n")
+                self.wfile.flush()
         else:
             self.send_error(404)
 
     def do_POST(self) -> None:
         """A decision about a row, such as /reject?line=N."""
-        parts = urlsplit(self.path)
-        line = parse_qs(parts.query).get("line", [""])[0]
+        line = self._query.get("line", [""])[0]
         if not self._allowed() or self.headers.get(HEADER) is None:
             self.send_error(403)
-        elif parts.path not in PATHS or not line.isdecimal():
+        elif self._parts.path not in PATHS:
             self.send_error(404)
+        elif not LINE.fullmatch(line):
+            self.send_error(400)
         else:
-            self.page.decisions.put(Sent({"do": parts.path[1:], "line": int(line)}, lambda _: None))
+            self.server.decisions.put(Sent({"do": self._parts.path[1:], "line": int(line)}))
             self._begin("text/plain")
 
     def log_message(self, *_: object) -> None:
@@ -183,7 +177,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _allowed(self) -> bool:
-        if self.page.token:
-            given = parse_qs(urlsplit(self.path).query).get("token", [""])[0]
-            return secrets.compare_digest(given.encode(), self.page.token.encode())
+        if self.server.token:
+            given = self._query.get("token", [""])[0]
+            return secrets.compare_digest(given.encode(), self.server.token.encode())
         return self.headers.get("Host", "").rpartition(":")[0] in LOCAL

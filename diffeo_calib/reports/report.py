@@ -97,22 +97,16 @@ def page(
     found: Findings | KindFindings, words: ModuleType, made: Iterable[Section], title: str, data_sha256: str | None
 ) -> Page:
     """The page about these findings: what ``words`` say about them, these sections, and the record of the model."""
-    name, fit = _names(found.model, title)
+    (name, fit), summary = _names(found.model, title), found.model.summary
     return Page(
         title=name,
         subtitle=f"{fit}. Errors: {words.rows_of(found)}.",
         verdict=words.verdict(found),
-        warnings=warnings_of(found.model),
+        warnings=(summary.warnings or "").splitlines() if summary else [],
         advice=list(words.advice(found)),
         figures=dict(words.figures(found)),
         sections=[*made, sections.record(found.model, data_sha256 if found.new else None)],
     )
-
-
-def warnings_of(model: CalibratedKinematics) -> list[str]:
-    """Warnings of the fit of a model."""
-    summary = model.summary
-    return [] if summary is None or summary.warnings is None else summary.warnings.split("\n")
 
 
 def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:

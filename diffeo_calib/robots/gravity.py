@@ -139,7 +139,9 @@ class GravitySag:
         )
         unladen = [k for k, compliance in enumerate(self.compliances) if not compliance.loaded]
         for compliance, load in zip(self.compliances[len(unladen) :], parts[len(unladen) :], strict=True):
-            k = next(k for k in unladen if _same_sag(self.compliances[k], compliance))
+            joint, direction = compliance.joint, compliance.direction
+            same = [one.joint == joint and np.array_equal(one.direction, direction) for one in self.compliances]
+            k = next(k for k in unladen if same[k])
             own = self.compliances[k].places
             at = 3 * own.index(_representative(self.chain, compliance.places[0])) if own else 0
             parts[k] = torch.cat([parts[k][:at], parts[k][at : at + 3] + amount * load, parts[k][at + 3 :]])
@@ -221,11 +223,6 @@ def _under_payload(chain: Tree, link: str) -> list[Compliance]:
     seen, moved = _representative(chain, place), chain.arrays.seen_from_ground[0][place]
     found = [one for one in chain.arrays.compliances if moved[one.joint] and (not one.places or seen in one.places)]
     return [replace(one, places=(place,) if one.places else (), loaded=True) for one in found]
-
-
-def _same_sag(one: Compliance, other: Compliance) -> bool:
-    """Whether two compliances are of one joint in one direction."""
-    return one.joint == other.joint and np.array_equal(one.direction, other.direction)
 
 
 def _representative(chain: Tree, place: int) -> int:

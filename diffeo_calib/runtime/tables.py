@@ -235,7 +235,9 @@ def _quintic(c: Array, u: Array) -> Array:
 
 def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
     """A table of the sum of these functions; None if it would need more than :data:`MOST_CELLS` cells."""
-    knots = _apart(np.concatenate([np.linspace(0.0, TURN, FEWEST_CELLS + 1), *(s.kinks for s in sums)]))
+    places = np.sort(np.concatenate([np.linspace(0.0, TURN, FEWEST_CELLS + 1), *(s.kinks for s in sums)]))
+    places = places[np.concatenate([[True], np.diff(places) > CLOSEST_KNOTS_RAD])]
+    knots = np.concatenate([places[places < TURN - CLOSEST_KNOTS_RAD], [TURN]])
     values = _derivatives(sums, knots)
     limit = TOLERANCE * max(1.0, float(np.abs(values[:, 0]).max()))
     open_cells = np.ones(len(knots) - 1, dtype=bool)
@@ -267,10 +269,3 @@ def _split(
 
 def _derivatives(sums: Sequence[PeriodicSum], x: Array) -> Array:
     return np.sum([s.derivatives(x) for s in sums], axis=0)
-
-
-def _apart(places: Array) -> Array:
-    """Sorted places from 0 to 2 pi, without those that hardly differ from the one before."""
-    places = np.sort(places)
-    kept = places[np.concatenate([[True], np.diff(places) > CLOSEST_KNOTS_RAD])]
-    return np.concatenate([kept[kept < TURN - CLOSEST_KNOTS_RAD], [TURN]])

@@ -109,7 +109,8 @@ def main() -> None:
     with subprocess.Popen([sys.executable, "-m", "diffeo_calib", *words], stdout=subprocess.PIPE) as campaign:
         assert campaign.stdout is not None
         robot, feed = Robot(arm), Feed(json.loads(campaign.stdout.readline())["listening"])
-        tracker, number, answer = Tracker(robot), 0, dict[str, Any]()
+        tracker, answer = Tracker(robot), feed.send({})
+        number = answer["rows"]  # a program that starts again counts on
         first = [dict(zip(arm.nominal.joint_names, q, strict=True)) for q in arm.sample(FIRST_POSES).rad2deg().tolist()]
         while not answer.get("target_reached"):
             while not (first or answer["next"]):  # the first model takes some seconds, a robot about as long to move

@@ -8,10 +8,12 @@ import random
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -80,22 +82,24 @@ class Client:
 
 @pytest.fixture
 def run(tmp_path: Path, command: Command) -> Callable[..., tuple[Outcome, Any]]:
-    """Runs a campaign that listens beside a client, which ends it by Ctrl-C."""
+    """Runs a campaign that listens beside a client, which ends it by Ctrl-C unless it ends by itself within seconds."""
     ARM.write_urdf(tmp_path / "robot.urdf")
 
-    def both(client: Callable[[int], Any], *words: str) -> tuple[Outcome, Any]:
-        port = free_port()
+    def both(client: Callable[[int], Any], *words: object, seconds: float = 0.0) -> tuple[Outcome, Any]:
+        port, over = free_port(), Event()
 
         def ended() -> Any:
             try:
                 return client(port)
             finally:
-                os.kill(os.getpid(), signal.SIGINT)
+                if not over.wait(seconds):
+                    os.kill(os.getpid(), signal.SIGINT)
 
         with ThreadPoolExecutor() as pool:
             found = pool.submit(ended)
             robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
             done = command("campaign", tmp_path / "run.csv", *robot, "--listen", port, *words)
+            over.set()
         return done, found.result()
 
     return both
@@ -135,6 +139,104 @@ def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[...,
 
     _, answer = run(again, "--json-lines")
     assert (answer["line"], answer["accepted_rows"]) == (7, 5)
+
+
+def test_every_view_of_nothing(tmp_path: Path, run: Callable[..., tuple[Outcome, Any]]) -> None:
+    """A page before any row; each of what is sent first ended the campaign once."""
+    page = free_port()
+
+    @contextmanager
+    def asked(method: str, path: str) -> Iterator[HTTPResponse]:
+        connection = HTTPConnection("127.0.0.1", page, timeout=60)
+        connection.request(method, path, headers={"X-Campaign": "1"})
+        yield connection.getresponse()
+        connection.close()
+
+    def shown(text: str) -> int:
+        """Number of poses on the page when it says something."""
+        with asked("GET", "/events") as events:
+            for line in events:
+                if line.startswith(b"data: {"):
+                    state = json.loads(line.removeprefix(b"data: "))
+                    if state.get("state", "").startswith(text):
+                        return len(state["done"])
+        return -1
+
+    def client(port: int) -> list[Any]:
+        with Client(port) as one:
+            seen = [one.first, *map(one.ask, (b"{}\n", b'{"do": "reject", "line": 2}\n', b'{"joint_1": 1}\n'))]
+            for method, path in (
+                ("GET", "/"),
+                *(("POST", f"/{what}?line=2") for what in ("accept", "reject", "repeat")),
+            ):
+                with asked(method, path) as answer:
+                    assert answer.status == 200
+            assert shown("0 of 0 rows accepted; no model yet") == 0
+            seen.append(one.ask(row(0)))
+            assert shown("1 of 1") == 1
+            return [*seen, one.ask(b'{"do": "repeat", "line": 2}\n')]
+
+    done, (first, again, decision, unreadable, taken, repeated) = run(client, "--page", page)
+    assert done.code == 130, done.err
+    assert first["rows"] == again["rows"] == 0
+    assert "there is none yet" in decision["error"]
+    assert "header" in unreadable["error"]
+    assert (taken["line"], len(repeated["next"])) == (2, 1)
+
+
+def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Outcome, Any]]) -> None:
+    """A program that counts anew loses no row in silence, also after the campaign was started again."""
+
+    def client(port: int) -> list[dict[str, Any]]:
+        with Client(port) as one:
+            first = one.ask(row(0)), one.ask(row(1)), one.ask(row(2, id="two"))
+            same = one.ask(row(1)), one.ask(row(1, id="1")), one.ask(row(2, id="two"))
+            other = one.ask(row(3, id=1)), one.ask(row(3, id="1")), one.ask(row(3, id="two"))
+            return [*first, *same, *other, one.ask(row(3, id=None)), one.ask(row(3, id=""))]
+
+    for _ in range(2):
+        done, answers = run(client, "--json-lines")
+        assert done.code == 130
+        assert [one.get("line") for one in answers] == [2, 3, 4, 3, 3, 4, *5 * [None]]
+        assert all("whose values are others" in one["error"] for one in answers[6:9])
+        assert all("leave it out" in one["error"] for one in answers[9:])
+    assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
+
+
+def test_a_row_that_is_none_ends_nothing(run: Callable[..., tuple[Outcome, Any]]) -> None:
+    """Neither the campaign nor the connection."""
+    bad = [row(1).replace(b'"x": ', b'"x": %s, "y": ' % value) for value in (b"1e999", b"NaN", b"true", b"[1]")]
+    bad += [row(1).replace(b'"id": 1', b'"id": %s' % value) for value in (b"1e999", b"-Infinity", b"false", b"[]")]
+
+    def client(port: int) -> list[dict[str, Any]]:
+        with Client(port) as one:
+            return [one.ask(text) for text in [*bad, row(0)]]
+
+    done, (*refused, taken) = run(client, "--json-lines")
+    assert done.code == 130
+    for one, name in zip(refused, 4 * ["x"] + 4 * ["id"], strict=True):
+        assert f"'{name}' of a row: expected a finite number" in one["error"]
+    assert taken["line"] == 2
+
+
+def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Any]]) -> None:
+    """The next row lost its first characters, and was accepted."""
+
+    def client(port: int) -> tuple[dict[str, Any], str]:
+        with Client(port) as one:
+            for number in range(3):
+                one.ask(row(number))
+            path = tmp_path / "run.csv"
+            whole = path.read_text()
+            path.write_text(whole[:-20] + whole[-17:])
+            return one.ask(row(3)), whole[:-20] + whole[-17:]
+
+    done, (answer, edited) = run(client, seconds=20.0)
+    assert done.code == 1
+    assert "was changed" in done.error
+    assert "error" in answer
+    assert "line" not in answer
+    assert (tmp_path / "run.csv").read_text() == edited
 
 
 @pytest.mark.parametrize("typed", [True, False])

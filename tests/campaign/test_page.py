@@ -7,6 +7,7 @@ import http.client
 import json
 import os
 import shutil
+import socket
 import tracemalloc
 from collections.abc import Iterator
 from queue import Queue
@@ -60,7 +61,12 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
     mine = {"X-Campaign": "1"}
     assert answer(page, "POST", "/reject?line=3") == 403
     assert answer(page, "POST", "/reject?line=3", Host="evil.example", **mine) == 403
-    assert answer(page, "POST", "/reject?line=x", **mine) == 404
+    assert answer(page, "POST", "/remove?line=3", **mine) == 404
+    for line in ("x", "", "-1", "1.5", 5000 * "9", "%D9%A3"):
+        assert answer(page, "POST", f"/reject?line={line}", **mine) == 400
+    with socket.create_connection(page.server_address[:2], timeout=10) as raw:
+        raw.sendall(b"GET http://[/ HTTP/1.0\r\n\r\n")
+        assert b" 400 " in raw.makefile("rb").readline()
     assert page.decisions.empty()
     assert answer(page, "POST", "/reject?line=3", **mine) == 200
     assert answer(page, "POST", "/accept?line=4", **mine) == 200
@@ -87,7 +93,7 @@ def test_events_hold_everything_and_end_with_the_campaign(page: Page) -> None:
     for row in (2, 3):
         page.publish({"row": row})
     assert json.loads(next(first)) == {"row": 3}
-    page.close()
+    page.end()
     assert list(first) == []
 
 
@@ -109,6 +115,10 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
     assert len(state["done"]) == 16
     assert len(state["links"]) == 7
     empty = dc.Campaign(ARM.nominal)
+    state = json.loads(json.dumps(state_of(empty, ("no model yet", ""), empty.next(1)), allow_nan=False))
+    assert state["state"] == "0 of 0 rows accepted; no model yet"
+    for name in ("done", "next", "links", "verdicts", "curve", "forecast"):
+        assert state[name] == []
     empty.add(torch.zeros(6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     assert state_of(empty, ("no model yet", ""), None)["error"] is None
 

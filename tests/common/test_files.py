@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import stat
@@ -44,6 +45,34 @@ def test_follows_links(tmp_path: Path) -> None:
     write_whole(tmp_path / "link", b"new")
     assert (tmp_path / "a").read_bytes() == b"new"
     assert (tmp_path / "link").is_symlink()
+
+
+def test_the_content_is_on_the_disk_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done, fsync, replace = list[str](), os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda file: (done.append("fsync"), fsync(file)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
+    write_whole(tmp_path / "a", b"content")
+    assert done == ["fsync", "replace"]
+
+
+@pytest.mark.parametrize(("number", "written"), [(errno.EINVAL, True), (errno.ENOTSUP, True), (errno.EIO, False)])
+def test_a_file_system_without_fsync_or_locks(
+    number: int, written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refused)
+    monkeypatch.setattr("fcntl.flock", refused)
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    if written:
+        write_whole(path, b"new")
+    else:
+        with pytest.raises(InputError, match="Input/output error"):
+            write_whole(path, b"new")
+    assert path.read_bytes() == (b"new" if written else b"old")
+    assert names(tmp_path) == ["a"]
 
 
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:

@@ -310,8 +310,8 @@ def evenly_growing(effects: Tensor, order: Tensor) -> Tensor:
 def _drift(effects: Tensor, columns: Tensor, process: Process) -> ChangePoint:
     """The change from the first row to the last that explains most."""
     C = process.numbers.of_table(columns)
-    g = C.T @ process.mu
-    u = _solved(C.T @ process.inverse @ C, g)
+    g, H = C.T @ process.mu, C.T @ process.inverse @ C
+    u = torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g  # noise-free rows may leave H singular even so
     return ChangePoint(0, float(g @ u), u, effects)
 
 
@@ -328,11 +328,6 @@ def _ridge(H: Tensor) -> Tensor:
     """Ridge that keeps H (..., U, U) invertible where rows do not determine all unknowns."""
     level = RELATIVE_RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
     return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
-
-
-def _solved(H: Tensor, g: Tensor) -> Tensor:
-    """H^-1 g (..., U); noise-free rows may leave H singular even so."""
-    return (torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g[..., None])[..., 0]
 
 
 def causes_of(data: TangentData) -> list[Cause]:
@@ -382,7 +377,7 @@ def find_change_point(
         for v in range(u + 1):
             H[:, u, v] = H[:, v, u] = by_row((half * E[:, v]).T).cumsum(0).cumsum(1).diagonal()
     H = H + RELATIVE_RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
-    u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]  # noise-free rows may leave H singular
+    u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]
     gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
     count = int(gains.argmax()) + fewest_rows  # rows after the change point
     return ChangePoint(n - count, float(gains.max()), u[count - 1], effects)

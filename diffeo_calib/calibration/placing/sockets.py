@@ -393,7 +393,9 @@ def stages_by_sockets(
         registration = replace(registration, tails=tails)
     identification, places = geometry_by_sockets(data, found.positions, registration)
     if device is not None and start is not None:
-        check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
+        seen = identification.geometry  # without the ball, which a device does not see
+        seen = seen.with_tool(seen.tool[:-1], seen.on[:-1])
+        check_identification(device, replace(identification, geometry=seen))
         check_deviations(device, start)
         warn_of_other_robot(robot, device, start, found)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
@@ -406,11 +408,6 @@ def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
         return None
     resting = data.with_sockets_of_rows().socket_rows()
     return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
-
-
-def _without_ball(geometry: Geometry) -> Geometry:
-    """The geometry of the markers that a device saw."""
-    return geometry.with_tool(geometry.tool[:-1], geometry.on[:-1])
 
 
 def _ball(geometry: Geometry, data: Measurements) -> Tensor:

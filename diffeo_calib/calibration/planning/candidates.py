@@ -195,7 +195,7 @@ def candidates(
     if places is not None:
         sockets = as_tensor(places, "places", ("D", 3), fix="pass x, y, z of every socket, in m")
         at_ball = as_tensor((0.0, 0.0, 0.0) if ball is None else ball, "ball", (3,))
-        criteria = {"places": _within(lower, upper), **criteria}
+        criteria = {"places": lambda q: ((q >= lower) & (q <= upper)).all(1), **criteria}
     generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
     seen = dict.fromkeys(criteria, 0)
     passed = dict.fromkeys(criteria, 0)
@@ -230,11 +230,6 @@ def brought_to(robot: Tree, q: Tensor, ball: Tensor, places: Tensor) -> Tensor:
         q = q + (J.mT @ torch.linalg.solve(damped, away))[..., 0].clamp(-LARGEST_STEP, LARGEST_STEP)
     away = (places - geometry.points(q)[:, 0]).norm(dim=1, keepdim=True)
     return torch.where(away < REACHED_M, q, torch.nan)
-
-
-def _within(lower: Tensor, upper: Tensor) -> Criterion:
-    """Whether all joints are within their ranges; not for NaN."""
-    return lambda q: ((q >= lower) & (q <= upper)).all(1)
 
 
 def joint_ranges(robot: Tree, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from itertools import chain
 from queue import Empty, Queue
 from threading import Thread
 
 import typer
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import Listener, Sent, listening, read_lines
+from diffeo_calib.campaign.feeds import ID, Listener, Sent, listening, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.commands.fit import RobotFile
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.live import ID, Live, Shown, expected
+from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
@@ -46,7 +47,7 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
-        live = Live(campaign, source, links.tips, journal, Shown(given.next, given.json_lines))
+        live = Live(campaign, source, links.tips, journal, given)
         live.resume()
         inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
@@ -55,11 +56,13 @@ def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
             if face is not None:
                 live.say(f"the campaign is {where} at {face}", {where: face})
         if given.bag is not None:
-            Thread(target=play, args=(played, inbox, live.ids, given.speed), daemon=True).start()
+            left = [row for row in played if live.known(row) is None]
+            Thread(target=play, args=(left, inbox, given.speed), daemon=True).start()
         code = _followed(live, given, inbox, page)
-        _end(live, inbox, listener)
+        _end(live, listener)
     if given.accepted is not None:
-        write_whole(given.accepted, live.table.header + b"".join(live.lines_of(campaign.accepted)))
+        numbers = dict.fromkeys(live.owner[row] for row in campaign.accepted)
+        write_whole(given.accepted, live.table.header + b"".join(live.lines[number] for number in numbers))
     if code:
         raise typer.Exit(code)
 
@@ -76,22 +79,17 @@ def _stops(source: MeasuredTable, given: LiveOptions) -> list[dict[str, float]]:
     if not seen.values.shape[1]:
         fix = "use `record`, then `images`"
         raise InputError.of(f"{given.seen} of --bag", expected="places that a device measured", got="images", fix=fix)
-    return rows_of(names, stops(joints, seen)[0])
+    return [{ID: number, **row} for number, row in enumerate(rows_of(names, stops(joints, seen)[0]))]
 
 
 def play(
-    rows: Sequence[dict[str, float]],
-    inbox: Inbox,
-    known: Container[str],
-    speed: float,
-    sleep: Callable[[float], object] = time.sleep,
+    rows: Sequence[dict[str, float]], inbox: Inbox, speed: float, sleep: Callable[[float], object] = time.sleep
 ) -> None:
-    """Put rows into an inbox at their times [s], then None; those whose numbers are known were taken in before."""
-    left = [(number, row) for number, row in enumerate(rows) if str(number) not in known]
-    begin = time.monotonic() - left[0][1]["time"] / speed if left else 0.0
-    for number, row in left:
+    """Put rows into an inbox at their times [s], then None."""
+    begin = time.monotonic() - rows[0]["time"] / speed if rows else 0.0
+    for row in rows:
         sleep(max(begin + row["time"] / speed - time.monotonic(), 0.0))
-        inbox.put(Sent({ID: number, **row}, lambda _: None))
+        inbox.put(Sent(row))
     inbox.put(None)
 
 
@@ -99,7 +97,7 @@ def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -
     """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
-        for news in _happening(live, given, inbox):
+        for news in chain([True], _happening(live, given, inbox)):
             step("campaign", 0, 1)
             if page is not None and news:
                 page.publish(state_of(live.campaign, live.words, live.found))
@@ -114,7 +112,7 @@ def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -
 def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
-        Thread(target=read_lines, args=(sys.stdin.buffer, inbox, lambda _: None), daemon=True).start()
+        Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()
     while True:
         lines = live.new_lines()
         live.judge(lines)
@@ -134,15 +132,11 @@ def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
             return
 
 
-def _end(live: Live, inbox: Inbox, listener: Listener | None) -> None:
-    """Say how a campaign ended, also to those who have sent something since."""
+def _end(live: Live, listener: Listener | None) -> None:
+    """Say how a campaign ended."""
     state = live.state() | {"ended": True}
     if listener is not None:
         listener.last = state
-    while not inbox.empty():
-        sent = inbox.get()
-        if sent is not None:
-            sent.answer(state | {"error": "the campaign has ended; the row was not taken in"})
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
     later = live.ignored + len(live.new_lines())

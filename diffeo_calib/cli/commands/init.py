@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
@@ -36,7 +37,7 @@ class Choice:
     def line(self) -> str:
         """As TOML."""
         values = self.value if isinstance(self.value, list) else [self.value]
-        written = [str(value).lower() if isinstance(value, bool) else _quoted(value) for value in values]
+        written = [json.dumps(value, ensure_ascii=False) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
         return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
@@ -146,7 +147,3 @@ def _used(choices: list[Choice]) -> set[str]:
     texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
     corners = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
     return corners | {name for text in texts for name in text.rpartition("=")[2].split(",")}
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

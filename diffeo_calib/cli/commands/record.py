@@ -29,22 +29,16 @@ def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, of
     else:
         offset = offset or 0.0
         found, without = pictured(joints, seen.times, limits, offset)
-        files = _write_images(bag, topics[1], output.parent, [time for _, time in found])
+        times, files = [time for _, time in found], dict[float, str]()
+        for time, suffix, content in read_images(bag, topics[1], times):
+            files[time] = f"{times.index(time):05d}{suffix}"
+            write_whole(output.parent / files[time], content)
         rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]
         write_whole(output, _text(rows))
         left = f"; {without} stops without an image were left out" * bool(without)
         say(f"{len(found)} images of stops written beside {shown(output)}{left}")
         say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")
     record.add(rows=len(found), clock_offset_s=offset, files={"table": output})
-
-
-def _write_images(bag: Path, topic: str, folder: Path, times: list[float]) -> dict[float, str]:
-    """Write the images of some times, in their order; the name of each."""
-    files = dict[float, str]()
-    for time, suffix, content in read_images(bag, topic, times):
-        files[time] = f"{times.index(time):05d}{suffix}"
-        write_whole(folder / files[time], content)
-    return files
 
 
 def _text(rows: list[dict[str, Any]]) -> bytes:

@@ -303,14 +303,9 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     if fitted.slopes is not None:  # what was measured has no direction of its own
         each = torch.block_diag(*[R] * (fitted.m // 3))
         return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y)
-    noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
+    noise = Noise(turned(fitted.noise.covariance, R), (R @ fitted.noise.shared.unflatten(1, (-1, 3))).flatten(1, 2))
     y = None if fitted.y is None else (fitted.y.unflatten(1, (-1, 3)) @ R.mT + T[:3, 3].to(device)).flatten(1)
     return FittedMap(deformation, noise, *parts, y=y)
-
-
-def turned_points(displacements: Tensor, R: Tensor) -> Tensor:
-    """Turned displacements of points: (N, 3 P, c), (3, 3) -> (N, 3 P, c)."""
-    return (R @ displacements.unflatten(1, (-1, 3))).flatten(1, 2)
 
 
 def turned(covariance: Tensor, R: Tensor) -> Tensor:

@@ -32,14 +32,9 @@ def verdict(found: KindFindings) -> str:
     *before, (_, own) = found.expected.items()
     listed = ", ".join(f"{1e3 * value:.2f} mm {printable(name)}" for name, value in before)
     line = f"{listed}, {1e3 * own:.3f} mm calibrated: RMS errors of positions that the model expects over the joint "
-    return f"{line}ranges of its rows. {'; '.join(_by_kind(found))}"
-
-
-def _by_kind(found: KindFindings) -> Iterator[str]:
-    for stages in found.kinds.values():
-        *_, own = stages.values()
-        unit, per_unit = own.shown
-        yield f"{own.title}: {per_unit * own.rms:.3f} {unit} RMS"
+    last = [[*stages.values()][-1] for stages in found.kinds.values()]
+    each = "; ".join(f"{one.title}: {one.shown[1] * one.rms:.3f} {one.shown[0]} RMS" for one in last)
+    return f"{line}ranges of its rows. {each}"
 
 
 def advice(found: KindFindings) -> Iterator[str]:
