@@ -116,7 +116,7 @@ class Linearised:
 
     def inner(self, recipe: Recipe, vector: Tensor, weights: Tensor) -> Tensor:
         """sum(weights * matrix), differentiable in the scales."""
-        fields = replace(self.lin, spec=recipe.spec(vector)).inner(weights)
+        fields = (weights * replace(self.lin, spec=recipe.spec(vector)).gram()).sum()
         return fields + recipe.scales(vector)["noise"][0] ** 2 * weights.trace()
 
     def take(self, rows: Tensor) -> Linearised:

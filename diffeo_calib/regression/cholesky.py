@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+
 import torch
 from torch import Tensor
 
