@@ -18,10 +18,10 @@ from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     causes_of,
-    check_possible,
     expected_covariance,
     expected_error,
     impossible,
+    impossible_errors,
     positions_of,
     some_rows,
 )
@@ -201,22 +201,22 @@ class Judgement:
     rows: int = 0
 
 
-def refuse_impossible(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
-    """Raise MeasurementError for errors that say nothing about the robot, with the likely mistake.
+def impossible_or_refused(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
+    """See :func:`~diffeo_calib.kinematics.evaluation.impossible_errors`.
 
-    Args:
-        model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
+    Raises:
+        MeasurementError: another reading of the table, or something that moved, explains the rows; it is named.
     """
     seen = positions_of(model, places, data)
     if seen is not None and found.positions is not None and impossible(model, found.positions):
         some = _refused_steps(model, seen)
         if not motions(model, some):
             refuse_mistakes(model.robot, some)
-    check_possible(model, places, data, found)
+    return impossible_errors(model, places, data, found)
 
 
 def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
-    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`refuse_impossible`.
+    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`impossible_or_refused`.
 
     Raises:
         MeasurementError: rows out of step with their joints.
