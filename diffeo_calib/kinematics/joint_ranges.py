@@ -36,17 +36,18 @@ def joints_outside_range(model: Any, q: object) -> Tensor:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
     fitted = fitted_configurations(model)
-    q = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+    values: Tensor = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
     low, high = fitted.amin(0), fitted.amax(0)
     margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
-    outside = (q < low - margin) | (q > high + margin)
-    turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=q.device)
-    turning = turning & (q.abs() < LARGEST_JOINT_ANGLE_RAD)  # else they are degrees
+    outside = (values < low - margin) | (values > high + margin)
+    turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=values.device)
+    turning = turning & (values.abs() < LARGEST_JOINT_ANGLE_RAD)  # else they are degrees
     turns = (fitted % (2 * pi)).sort(0).values
-    gaps, after = (torch.cat([turns[1:], turns[:1] + 2 * pi]) - turns).max(0)
-    low, arc = turns[(after + 1) % len(turns), torch.arange(turns.shape[1], device=q.device)], 2 * pi - gaps
+    gaps, last = (torch.cat([turns[1:], turns[:1] + 2 * pi]) - turns).max(0)
+    first = turns.gather(0, (last + 1)[None] % len(turns))[0]
+    arc = 2 * pi - gaps
     margin = RANGE_MARGIN * arc + SAME_CONFIGURATION
-    return torch.where(turning, (q - low + margin) % (2 * pi) > arc + 2 * margin, outside)
+    return torch.where(turning, (values - first + margin) % (2 * pi) > arc + 2 * margin, outside)
 
 
 def fitted_configurations(model: object) -> Tensor:
