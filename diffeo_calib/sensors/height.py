@@ -114,12 +114,18 @@ class Planes(Devices):
     @classmethod
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Heights per height that the tip's poses explain."""
-        _check_factor(1.0 / max(height_factor(data, R, t), 1.0))
+        factor = height_factor(data, R, t)
+        if factor > UNIT_RATIO:
+            what = f"the heights are about {factor:.3g} times larger than the robot moves along the planes' normals"
+            text = sentence(what, fix="check the unit of the heights (mm or m)")
+            if in_other_unit(factor, OTHER_UNIT):
+                raise MeasurementError(text)
+            warn_user(text)
 
     @classmethod
-    def check_start(cls, data: Readings, errors: Tensor) -> None:
+    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
         """By how much the ball's heights change per change of the measured ones."""
-        _check_factor(_factor(data, errors))
+        return not 1 / UNIT_RATIO < _factor(data, errors) < UNIT_RATIO
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """Directions that no plane faces."""
@@ -155,21 +161,6 @@ def height_factor(data: Readings, R: Tensor, t: Tensor) -> float:
         if float(unexplained) < LARGEST_UNEXPLAINED * float(heights.var()):
             factors.append(float(found[:3].norm()))
     return max(factors)
-
-
-def _check_factor(factor: float) -> None:
-    """Doubt heights that move ``factor`` times as much along the planes' normals as was measured.
-
-    Raises:
-        MeasurementError: they do not in the other unit.
-    """
-    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
-        times = f"{factor:.3g} times smaller" if factor > 1.0 else f"{1 / factor:.3g} times larger"
-        what = f"the heights are about {times} than the robot moves along the planes' normals"
-        text = sentence(what, fix="check the unit of the heights (mm or m)")
-        if in_other_unit(factor, OTHER_UNIT):
-            raise MeasurementError(text)
-        warn_user(text)
 
 
 def _factor(data: Readings, errors: Tensor) -> float:

@@ -198,8 +198,8 @@ def test_readings_in_another_unit_are_refused() -> None:
     arm = SimulatedArm(2)
     wide, narrow = readings(arm, "height", 45), touched(arm, (-0.008, 0.0, 0.008), 45)
     for data, factor, said in (
-        (wide, 1e3, "times larger than the robot moves"),
-        (narrow, 1e-3, "times smaller than the robot moves"),
+        (wide, 1e3, "1000 times too large: check the units of the readings"),
+        (narrow, 1e-3, "1000 times too small: check the units of the readings"),
         (readings(arm, "distance", 51), 1e-3, "1000 times too small: check the units of the readings"),
     ):
         with pytest.raises(MeasurementError, match=said):

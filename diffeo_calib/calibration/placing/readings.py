@@ -190,9 +190,8 @@ def identify_readings(
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
-    for data, own in zip(tables, rough.errors, strict=True):
-        kind_of(data).check_start(data, own)
-    if worst[0] > LARGEST_SHARE * bare.chain.reach:
+    doubted = [kind_of(data).doubts_unit(data, own) for data, own in zip(tables, rough.errors, strict=True)]
+    if any(doubted) or worst[0] > LARGEST_SHARE * bare.chain.reach:
         _doubt(bare, tables, still, poses, worst)
     rms = _rms(rough.errors)
     start = rows.geometry.absorb(rough.theta)
@@ -456,7 +455,7 @@ def _doubt(
         "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}",
     }
     for factor, words in ((1e3, "small"), (1e-3, "large")):
-        other = [replace(own, values=factor * own.values) if own.unit[0] == "m" else own for own in tables]
+        other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
         found = _rough_fits(bare, other, scale, _starts(bare.tool[0], other, poses), poses)
         if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
