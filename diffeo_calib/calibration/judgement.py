@@ -17,6 +17,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence, w
 from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
+    LARGEST_ERROR_PER_REACH,
     causes_of,
     expected_covariance,
     expected_error,
@@ -159,7 +160,7 @@ def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] |
 
 LARGE_PER_REACH, LARGE_PER_USUAL = 0.01, 20.0
 """Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
-are no errors of a calibrated robot."""
+are no errors of a calibrated robot; nor are those above a tenth of its reach."""
 MOST_LARGE = 0.25
 """Share of the rows from which such errors fail a fit."""
 
@@ -171,7 +172,8 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
         model: the fitted model. found: errors of positions, of rows that were held out if there are any.
         usual: median error of the rows of the fit after a geometric calibration, m.
     """
-    limit = max(LARGE_PER_REACH * model.robot.reach, LARGE_PER_USUAL * usual)
+    reach = model.robot.reach
+    limit = min(max(LARGE_PER_REACH * reach, LARGE_PER_USUAL * usual), LARGEST_ERROR_PER_REACH * reach)
     share = float((known(found.errors) > limit).double().mean())
     if share > MOST_LARGE:
         raise MeasurementError.of(

@@ -336,7 +336,8 @@ class RegistrationLimits:
         examined_residual: relative residual from which joint offsets are estimated.
         remaining: largest part of the residual that may remain with offsets that are accepted.
         accepted_residual: largest relative residual that may remain with them.
-        largest_offset_rad: largest offset of a turning joint that is accepted.
+        largest_offset_rad: largest offset of a turning joint that is accepted. left_out: largest error of left-out rows
+            after a geometric calibration, in that of one without these offsets.
         reported: smallest offset that is reported, as a part of the largest.
     """
 
@@ -349,6 +350,7 @@ class RegistrationLimits:
     remaining: float = 0.3
     accepted_residual: float = 0.02
     largest_offset_rad: float = 0.8
+    left_out: float = 1.1
     reported: float = 0.2
 
 
@@ -423,7 +425,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
         return registration
     q, points = data.q[inliers], data.points[inliers]
     errors = [_left_out(geometry, q, points, with_offsets=tried) for tried in (True, False)]
-    if errors[0] >= errors[1]:
+    if errors[0] > ROBUST.left_out * errors[1]:
         return registration
     text = sentence(
         f"joint offsets are far from the robot's description: {_large_offsets(chain, offsets)}",
@@ -435,7 +437,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
 
 
 def _left_out(geometry: Geometry, q: Tensor, points: Tensor, *, with_offsets: bool) -> float:
-    """Median distance, m, of rows from a geometric calibration of the others, with joint offsets before it or without.
+    """RMS distance, m, of rows from a geometric calibration of the others, with joint offsets before it or without.
 
     Args:
         geometry: a registered robot. q: (N, n). points: (N, P, 3) m.
@@ -447,7 +449,7 @@ def _left_out(geometry: Geometry, q: Tensor, points: Tensor, *, with_offsets: bo
         if with_offsets:
             start = register(with_joint_offsets(start, find_joint_offsets(start, *train)), *train, geometry.on).geometry
         found.append((identify(start, *train).geometry.points(q[own]) - points[own]).norm(dim=-1))
-    return float(torch.cat(found).nanmedian())
+    return float(torch.cat(found).square().nanmean().sqrt())
 
 
 def _large_offsets(chain: Tree, offsets: Tensor) -> str:
