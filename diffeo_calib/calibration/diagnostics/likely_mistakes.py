@@ -20,6 +20,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, InputError, sentence, shown, warn_user
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
@@ -225,7 +226,7 @@ def _residual(reading: Reading) -> float:
     """Median distance after registration of a random subset of the rows, m; infinite if that cannot be done."""
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: LIMITS.rows]
-    if len(q) < 2 * (2 + reading.robot.n) or not can_register(points[rows]):
+    if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return torch.inf
     try:
         geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
