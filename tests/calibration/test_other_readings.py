@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -180,6 +181,8 @@ def test_what_a_reading_leaves_must_be_small() -> None:
     one, two = torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
     one[2], two[[2, 4]] = -1.0, -1.0
     assert "elbow_joint seems to count" in advice(arm.nominal, dc.Measurements(q * one, points))
+    one[2] = 180 / math.pi
+    assert "elbow_joint seem to be degrees" in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
     for wrong_q, wrong_points in ((q * two, points), (q, 0.01 * points), (q, 10 * points)):
         assert advice(arm.nominal, dc.Measurements(wrong_q, wrong_points)) == ""
 
