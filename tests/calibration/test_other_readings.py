@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -36,12 +37,12 @@ def posed() -> tuple[SimulatedArm, dc.Measurements]:
     return arm, train
 
 
-def advice(robot: dc.Chain, data: dc.Measurements) -> str:
+def advice(robot: dc.Tree, data: dc.Measurements) -> str:
     return likely_mistake(robot, data, residual_of(robot, data))
 
 
 def written_and_read(
-    folder: Path, data: dc.Measurements, robot: dc.Chain, convention: str, wrong: dict[str, object]
+    folder: Path, data: dc.Measurements, robot: dc.Tree, convention: str, wrong: dict[str, object]
 ) -> dc.Measurements:
     """Poses after they were written in one convention and read with other options."""
     unit = None if convention.startswith(("quat", "matrix")) else "deg"
@@ -209,4 +210,5 @@ def test_a_reading_that_cannot_be_registered_says_nothing() -> None:
     arm = SimulatedArm(seed=1)
     q, points = arm.measure(30, seed=2)
     points[2, 0, 1] = torch.nan
-    assert residual_of(arm.nominal, SimpleNamespace(q=q, points=points, on=None)) == torch.inf
+    rows: Any = SimpleNamespace(q=q, points=points, on=None)
+    assert residual_of(arm.nominal, rows) == torch.inf
