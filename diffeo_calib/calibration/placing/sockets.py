@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
-from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_identification, registered
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
     check_sockets,
@@ -361,7 +361,6 @@ def coordinate_stages(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, own.table.q, own.table.points)
     check_identification(own.table, identification)
-    check_deviations(own.table, registration)
     return [], own.table, (registration, identification)
 
 
@@ -396,7 +395,6 @@ def stages_by_sockets(
         seen = identification.geometry  # without the ball, which a device does not see
         seen = seen.with_tool(seen.tool[:-1], seen.on[:-1])
         check_identification(device, replace(identification, geometry=seen))
-        check_deviations(device, start)
         warn_of_other_robot(robot, device, start, found)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
     return places, places.placed(data), (registration, identification)
