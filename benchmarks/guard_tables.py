@@ -19,7 +19,7 @@ import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
 
 SIZES, SPLITS, ALL_ROWS, ALL_SPLITS = (30, 60, 150), 5, 442, 2
-AGAIN_SIZES, DRAWS, OLD_ROWS = (5, 10, 20, 60), 3, 300
+AGAIN_SIZES, DRAWS, OLD_ROWS = (5, 10, 20, 60), 3, 200
 SERIES = {"UR10 D": "measurements_iso_cubes.csv", "UR10 A": "measurements_grid_900.csv"}
 SOCKETS = {"panda_3": (3, 6), "kuka_14": (2, 3)}
 """Robots that a ball in sockets measured -> every how many rows take part, and the places."""
@@ -64,21 +64,25 @@ def calibrated(name: str, rows: int, split: int, folder: Path) -> Iterator[Recor
     yield {"verb": "evaluate"} | case | seconds | {"error": 1e3 * found.rms}
 
 
-def again(old: str, folder: Path) -> Iterator[Record]:
-    """A model of one series of the UR10 that meets a few rows of the other."""
+@cache
+def old_model(old: str, folder: Path) -> Any:
+    """The model of a series of the UR10."""
     robot, before = series(old, folder)
+    return timed(lambda: dc.calibrate(robot, before.rows(drawn_rows(len(before), OLD_ROWS, 0)[0])))[0].model
+
+
+def again(old: str, rows: int, folder: Path) -> Iterator[Record]:
+    """A model of one series of the UR10 that meets a few rows of the other."""
     new = next(name for name in SERIES if name != old)
-    _, data = series(new, folder)
-    model = timed(lambda: dc.calibrate(robot, before.rows(drawn_rows(len(before), OLD_ROWS, 0)[0])))[0].model
-    for rows in AGAIN_SIZES:
-        for draw in range(DRAWS):
-            some, others = drawn_rows(len(data), rows, draw)
-            table, test = data.rows(some), data.rows(others[:400])
-            case: Record = {"case": f"{old} to {new[-1]}, {rows} rows", "arm": draw}
-            placed, seconds = timed(lambda table=table: model.registered(table))
-            yield {"verb": "registered"} | case | seconds | of_measured(placed, test)
-            found, seconds = timed(lambda table=table: dc.recalibrate(model, table))
-            yield {"verb": "recalibrate"} | case | seconds | of_measured(found.model, test)
+    (_, data), model = series(new, folder), old_model(old, folder)
+    for draw in range(DRAWS):
+        some, others = drawn_rows(len(data), rows, draw)
+        table, test = data.rows(some), data.rows(others[:400])
+        case: Record = {"case": f"{old} to {new[-1]}, {rows} rows", "arm": draw}
+        placed, seconds = timed(lambda table=table: model.registered(table))
+        yield {"verb": "registered"} | case | seconds | of_measured(placed, test)
+        found, seconds = timed(lambda table=table: dc.recalibrate(model, table))
+        yield {"verb": "recalibrate"} | case | seconds | of_measured(found.model, test)
 
 
 def left_out(name: str, place: int, folder: Path) -> Iterator[Record]:

@@ -25,7 +25,7 @@ false ones, `named`, faults that were; `expected` mm after a plan, which is not 
 PLANNED = {"positions": 20, "poses": 15}
 """Kinds whose robot is calibrated with so many planned rows."""
 COMPARED = ("positions", "several kinds")
-CAMPAIGNS = ("positions", "poses", "distances", "mixture", "images of a board")
+CAMPAIGNS = ("positions", "distances", "images of a board")
 CAMPAIGN_ROWS, FAULT_M = 40, 3e-3
 TURNS = torch.tensor([[1.0] * 3 + [LEVER_M] * 3], dtype=torch.float64)
 
