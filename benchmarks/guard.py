@@ -29,6 +29,7 @@ for _folder in ("benchmarks/robustness", "benchmarks/real_robots", "tests/banks"
 
 import argparse
 import json
+import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -99,7 +100,9 @@ def measure(plan: argparse.Namespace) -> list[Record]:
     data = os.environ.get(VARIABLE)
     if not data and not plan.quick:
         print(f"measured robots are left out: {VARIABLE} names no folder", file=sys.stderr)
-    work = [job for job in jobs(plan.quick, Path(data) if data else None) if plan.only in " ".join(map(str, job))]
+    work = [
+        job for job in jobs(plan.quick, Path(data) if data else None) if re.search(plan.only, " ".join(map(str, job)))
+    ]
     if plan.jobs == 1:
         return [record for job in track(work, "measuring", transient=True) for record in measured(job)]
     found: list[Record] = []
@@ -270,7 +273,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="two kinds, one arm: less than a minute")
     parser.add_argument("--jobs", type=harness.count, default=1, metavar="N", help="processes")
-    parser.add_argument("--only", default="", metavar="TEXT", help="jobs whose words hold this text")
+    parser.add_argument("--only", default="", metavar="REGEX", help="jobs whose words match")
     parser.add_argument("--baseline", type=Path, metavar="FILE.json", help="write what was measured")
     parser.add_argument("--against", type=Path, metavar="FILE.json", help="judge by this baseline")
     parser.add_argument(

@@ -25,10 +25,9 @@ from guard_kinds import (
     drawn,
     flange_poses,
     noisy_poses,
-    poses_of,
     sampled,
 )
-from simulated_camera import CameraArm, camera_arm, fixed_camera_arm, images_of_both
+from simulated_camera import CameraArm, camera_arm, fixed_camera_arm, images_of_both, poses_of
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -45,7 +44,7 @@ def parts_of(whole: CameraArm, counts: Sequence[int], *, on_tool: bool) -> dict[
     for part, count in enumerate(counts):
         q = whole.q[first : first + count]
         arm = whole.arm.worn(JOINT, GROWTH) if part == WORN else whole.arm
-        seen = poses_of(arm.true_points(q))[:, 0]
+        seen = poses_of(arm.true_points(q))
         found[part] = replace(whole, arm=arm, q=q, boards=torch.linalg.inv(seen) if on_tool else seen)
         first += count
     return found
@@ -55,7 +54,7 @@ def robot_of(whole: CameraArm, arms: dict[int, CameraArm], rows: dict[int, Rows]
     """The robot of these rows; ``moved`` (4, 4) is where the measuring frame is seen from later."""
 
     def true(part: int, q: Tensor) -> Tensor:
-        seen = poses_of(arms[part].arm.true_points(q))
+        seen = poses_of(arms[part].arm.true_points(q))[:, None]
         return seen if moved is None or part == TRAIN else moved @ seen
 
     q, truth = whole.q[:JUDGED], {part: partial(true, part) for part in (TRAIN, LATER, WORN)}
@@ -67,7 +66,7 @@ def camera_on_tool(seed: int) -> Robot:
     whole = camera_arm(JUDGED + 200, seed)
     arms, rows = parts_of(whole, (40, 60, 15, 25), on_tool=True), {}
     for part, own in arms.items():
-        seen = noisy_poses(poses_of(own.arm.true_points(own.q)), (seed, part), POSE_NOISE_M)
+        seen = noisy_poses(poses_of(own.arm.true_points(own.q))[:, None], (seed, part), POSE_NOISE_M)
         seen = seen if part in (TRAIN, NEW) else ELSEWHERE @ seen
         names, boards = own.arm.nominal.joint_names, torch.linalg.inv(seen[:, 0])
         rows[part] = Rows(dc.Measurements.from_poses(own.q, boards, names, camera_on_tool=True), own.q, {"poses": seen})

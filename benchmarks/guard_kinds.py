@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from simulated_camera import LEVER, MARKS, poses_of
 from simulated_sockets import rest_in_sockets
 from torch import Tensor
 from two_arms_bank import HANDS, TwoArms, robot
@@ -30,9 +31,6 @@ TRAIN, NEW, LATER, WORN = range(4)
 JUDGED, JOINT, GROWTH = 200, 2, 3.0
 """Configurations at which the truth is known; the joint that wears, and the factor on its transmission errors."""
 NOISE_M, NOISE_RAD, NOISE_PX = 2e-5, 1e-4, 0.1
-LEVER_M = 0.1
-"""Errors of turns count as those of a point at this distance; three marks at it around a frame carry a pose."""
-MARKS = torch.tensor([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64)
 MASS_KG = 4.0
 """Payload of the new rows and of the truth, where there are payloads."""
 STATIONS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3], [-0.5, -1.1, 0.8]], dtype=torch.float64)
@@ -103,19 +101,11 @@ def with_base(arm: SimulatedArm, T: Tensor) -> SimulatedArm:
     return other
 
 
-def poses_of(points: Tensor) -> Tensor:
-    """Poses (N, T, 4, 4) that three marks of each (N, 3 T, 3) carry, m."""
-    marks = points.unflatten(1, (-1, 3))
-    x = torch.nn.functional.normalize(marks[:, :, 0] - marks.mean(2), dim=-1)
-    y = torch.nn.functional.normalize(marks[:, :, 1] - marks[:, :, 2], dim=-1)
-    return transforms(torch.stack([x, y, torch.linalg.cross(x, y)], -1), marks.mean(2))
-
-
 def flange_poses(arm: SimulatedArm, q: Tensor, payload: float | None) -> Tensor:
     """True poses (N, 4, 4) of the flange in the measuring frame, m."""
     other = copy.copy(arm)
-    other.truth = replace(arm.truth, tool=LEVER_M * MARKS, on=arm.truth.on[:1] * 3)
-    return poses_of(other.true_points(q, payload))[:, 0]
+    other.truth = replace(arm.truth, tool=LEVER * MARKS, on=arm.truth.on[:1] * 3)
+    return poses_of(other.true_points(q, payload))
 
 
 Measure = Callable[[SimulatedArm, int, int, tuple[int, int]], Rows]
@@ -147,7 +137,7 @@ def built(
 
     def true(part: int, at: Tensor) -> Tensor:
         points = arms[part].true_points(at, load)
-        return poses_of(points) if order is None else points[:, list(order)]
+        return poses_of(points)[:, None] if order is None else points[:, list(order)]
 
     truth = {part: partial(true, part) for part in (TRAIN, LATER, WORN)}
     return Robot(arm.nominal, rows, q, truth, flange_poses(arm, q, load), **known)
@@ -190,7 +180,7 @@ def with_frame(seed: int) -> SimulatedArm:
     """An arm with three marks around a frame on its tool."""
     arm = SimulatedArm(seed, markers=3)
     turned = rotation(torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64))
-    arm.truth = replace(arm.truth, tool=arm.truth.tool[:1] + LEVER_M * MARKS @ turned.mT)
+    arm.truth = replace(arm.truth, tool=arm.truth.tool[:1] + LEVER * MARKS @ turned.mT)
     return arm
 
 
@@ -204,7 +194,7 @@ def noisy_poses(poses: Tensor, seed: tuple[int, int], noise: float = NOISE_M) ->
 def posed(arm: SimulatedArm, count: int, part: int, seed: tuple[int, int]) -> Rows:
     """Poses of a frame on the tool."""
     q = sampled(arm, count, seed)
-    seen = noisy_poses(poses_of(arm.true_points(q)), seed)
+    seen = noisy_poses(poses_of(arm.true_points(q))[:, None], seed)
     return Rows(dc.Measurements.from_poses(q, seen[:, 0], arm.nominal.joint_names), q, {"poses": seen})
 
 

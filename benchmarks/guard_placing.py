@@ -33,9 +33,10 @@ from typing import Any
 import harness
 import numpy as np
 import torch
-from guard_kinds import CENTRE, FOCAL, LEVER_M, MARKS, NOISE_M, NOISE_PX, drawn, noisy_poses, poses_of
+from guard_kinds import CENTRE, FOCAL, NOISE_M, NOISE_PX, drawn, noisy_poses
 from guard_verbs import TURNS, aligned, errors_of, rms
 from harness import Record
+from simulated_camera import marks_of, poses_of
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -69,7 +70,7 @@ def anywhere(seed: int, frame: bool) -> SimulatedArm:
     """An arm with device and marker, or the marks of a frame, anywhere."""
     arm, rng = SimulatedArm(seed, markers=3 if frame else 1), np.random.default_rng([seed, 40])
     base, tool = somewhere(rng, AWAY_M), somewhere(rng, TOOL_M)
-    marks = LEVER_M * MARKS @ tool[:3, :3].mT + tool[:3, 3] if frame else tool[None, :3, 3]
+    marks = marks_of(tool) if frame else tool[None, :3, 3]
     arm.truth = replace(arm.truth, base=base, tool=marks)
     return arm
 
@@ -85,7 +86,7 @@ def table_of(kind: str, arm: SimulatedArm, seed: int) -> Any:
     if kind == "positions":
         return dc.Measurements(q, points + NOISE_M * drawn((seed, 1), *points.shape), names)
     if kind in ("poses", "camera on the tool"):
-        seen = noisy_poses(poses_of(points), (seed, 1))[:, 0]
+        seen = noisy_poses(poses_of(points)[:, None], (seed, 1))[:, 0]
         on_tool = kind != "poses"
         return dc.Measurements.from_poses(q, torch.linalg.inv(seen) if on_tool else seen, names, camera_on_tool=on_tool)
     return read(kind, q, (points[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3], rng, names)

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
-from guard_kinds import JOINT, LATER, LEVER_M, NEW, TRAIN, WORN, Robot, Rows
+from guard_kinds import JOINT, LATER, NEW, TRAIN, WORN, Robot, Rows
 from scipy.stats import chi2
+from simulated_camera import LEVER
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -27,7 +28,7 @@ PLANNED = {"positions": 20, "poses": 15}
 COMPARED = ("positions", "several kinds")
 CAMPAIGNS = ("positions", "distances", "images of a board")
 CAMPAIGN_ROWS, FAULT_M = 40, 3e-3
-TURNS = torch.tensor([[1.0] * 3 + [LEVER_M] * 3], dtype=torch.float64)
+TURNS = torch.tensor([[1.0] * 3 + [LEVER] * 3], dtype=torch.float64)
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, Record]:
