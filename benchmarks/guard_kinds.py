@@ -298,7 +298,11 @@ def ball_in_sockets(seed: int) -> Robot:
     """No device: a ball in the sockets of a block."""
     blocks = {TRAIN: (6, 8), NEW: (3, 8), LATER: (2, 6), WORN: (3, 8)}
     return built(
-        SimulatedArm(seed), lambda arm, _, part, own: resting(arm, part, own, *blocks[part]), seed, (0,) * 4, free=True
+        SimulatedArm(seed),
+        lambda arm, _, part, own: resting(arm, part, own, *blocks[part]),
+        seed,
+        (0, 0, 0, 0),
+        free=True,
     )
 
 
