@@ -378,7 +378,7 @@ def several_kinds(seed: int) -> Robot:
         devices = [read(arm, kind, count, seed) for kind in ("distance", "height", "image")]
         return together(tracked(arm, 20 if part == WORN else 40 if part == TRAIN else 15, part, seed, (1,)), *devices)
 
-    return built(SimulatedArm(seed, markers=2), measure, seed, (60, 30, 20, 30), order=(1, 0))
+    return built(SimulatedArm(seed, markers=2), measure, seed, (60, 30, 30, 30), order=(1, 0))
 
 
 def laser_beams(seed: int) -> Robot:

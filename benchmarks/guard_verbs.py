@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from math import prod
 from typing import Any
 
 import torch
@@ -118,26 +119,22 @@ def compared(mean: Tensor, covariance: Tensor, truth: Tensor) -> Record:
 
 
 def held_out(robot: Robot, model: Any, rows: Rows) -> Record:
-    """Errors and regions of measured values: positions or poses decide on the error, else readings."""
+    """Errors, their geometric mean over devices, and regions of measured values."""
     model, errors, inside = robot.loaded(model), [], []
     devices = {own.device: own for own in model.predict_readings(rows.q)}
     for name, values in rows.values.items():
         if name in ("points", "poses"):
             mean, covariance = predicted(model, rows.q, name == "poses", noise=True)
-            own = errors_of(mean[:, : values.shape[1]], values)
+            own, scale = errors_of(mean[:, : values.shape[1]], values), 1e3
             covariance = covariance[:, : values.shape[1]]
         else:
-            own, covariance = values - devices[name].mean, devices[name].covariance
-        errors.append(own * TURNS[0, : own.shape[-1]])
+            own, covariance, scale = values - devices[name].mean, devices[name].covariance, 1.0
+        errors.append(scale * own * TURNS[0, : own.shape[-1]])
         inside.append(covered(own, covariance))
     if not errors:
         return {}
-    lengths = [
-        own.square().sum(-1).flatten() for own in (errors[:1] if rows.values.keys() & {"points", "poses"} else errors)
-    ]
-    scale = 1e3 if rows.values.keys() & {"points", "poses"} else 1.0
     return {
-        "error": scale * float(torch.cat(lengths).nanmean().sqrt()),
+        "error": prod(map(rms, errors)) ** (1 / len(errors)),
         "new": float(torch.cat(inside).double().mean()),
     }
 
@@ -169,8 +166,8 @@ def _calibrate(name: str, robot: Robot, models: list[Any]) -> Record:
 
 def _evaluate(name: str, robot: Robot, models: list[Any]) -> Record:
     found, seconds = timed(lambda: dc.evaluate(models[0], robot.rows[NEW].table))
-    kinds = found.values() if isinstance(found, Mapping) else [found]
-    return seconds | {"error": 1e3 * next(iter(kinds)).rms}
+    each = [1e3 * own.rms for own in (found.values() if isinstance(found, Mapping) else [found])]
+    return seconds | {"error": prod(each) ** (1 / len(each))}  # of several kinds, each in its unit
 
 
 def _predict(name: str, robot: Robot, models: list[Any]) -> Record:
