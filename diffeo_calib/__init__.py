@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from diffeo_calib.calibration.planning.sensors import Sensor
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
-    from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
     from diffeo_calib.campaign.campaign import Campaign
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
     from diffeo_calib.fitting.fit import fit
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
+    from diffeo_calib.process.scales import Hyperparameters
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
     from diffeo_calib.robots.dh import DHRow, from_dh
@@ -122,7 +122,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "calibration.planning.sensors": "Sensor",
             "calibration.recalibration.compare": "Comparison ModelComparison compare",
             "calibration.recalibration.recalibrate": "Recalibration recalibrate",
-            "calibration.scales.hyperparameters": "Hyperparameters",
+            "process.scales": "Hyperparameters",
             "campaign.campaign": "Campaign",
             "common.errors": "DiffeoCalibError DiffeoCalibWarning",
             "fitting.fit": "fit",

@@ -37,7 +37,7 @@ FLOORS = (
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation, algorithms and figures"),
-    ("calibration.student_t", "noise with heavy tails"),
+    ("process", "what is known of robot and devices from rows: one Gaussian process"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),
     ("calibration.diagnostics", "measurements that cannot be right"),

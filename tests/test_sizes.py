@@ -1,10 +1,15 @@
-"""Small pieces: files, functions and lists of parameters stay short, in the package, the tests and the programs."""
+"""Small pieces: files, functions and lists of parameters stay short, in the package, the tests and the programs.
+
+And a package that only shrinks: its lines and those of each of its folders are held at the numbers of sizes.json.
+"""
 
 from __future__ import annotations
 
 import ast
 import io
+import json
 import tokenize
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -12,7 +17,9 @@ from pathlib import Path
 import diffeo_calib
 
 REPOSITORY = Path(diffeo_calib.__file__).parents[1]
-MOST_LINES, MOST_CODE_LINES, MOST_PARAMETERS = 500, 40, 8
+MOST_LINES, MOST_CODE_LINES, MOST_PARAMETERS = 500, 60, 8
+SIZES = Path(__file__).with_name("sizes.json")
+"""Name of each folder of the package, "root" and "total" -> its lines at most."""
 
 FILES = sorted(
     path
@@ -93,5 +100,48 @@ def test_big_pieces_are_found() -> None:
     names = ", ".join("abcdefghi")
     long = f"def f({names}):\n" + MOST_CODE_LINES * "    a = b\n" + MOST_LINES * "\n"
     found = [text.partition(": ")[2] for text in too_big(Path("f.py"), long)]
-    assert found == ["541 lines: split the file by subject", "41 lines of code: split f", "group the parameters of f"]
+    assert found == ["561 lines: split the file by subject", "61 lines of code: split f", "group the parameters of f"]
     assert not list(too_big(Path("f.py"), f"class Problem:\n    def __init__(self, {names}):\n        pass\n"))
+
+
+# --- lines only fall ----------------------------------------------------------------------------------------------
+
+
+def lines_of_package() -> dict[str, int]:
+    """Name of each folder of the package, "root" and "total" -> its lines."""
+    found: Counter[str] = Counter()
+    for path in Path(diffeo_calib.__file__).parent.rglob("*.py"):
+        parts = path.relative_to(Path(diffeo_calib.__file__).parent).parts
+        lines = path.read_text(encoding="utf-8").count("\n")
+        found.update({"total": lines, parts[0] if len(parts) > 1 else "root": lines})
+    return dict(found)
+
+
+def grown(found: dict[str, int], held: dict[str, int]) -> list[str]:
+    """Sentences about rooms with more lines than are recorded; a new one, which is not, may have what others lost."""
+    return [
+        f"{room}: {lines} lines, at most {held[room]}" for room, lines in found.items() if lines > held.get(room, lines)
+    ]
+
+
+def lowered(found: dict[str, int], held: dict[str, int]) -> dict[str, int]:
+    """What is recorded next: of every room that is still there the smaller number."""
+    return {room: min(lines, held.get(room, lines)) for room, lines in sorted(found.items())}
+
+
+def test_lines_only_fall() -> None:
+    found = grown(lines_of_package(), json.loads(SIZES.read_text(encoding="utf-8")))
+    advice = "delete as much as you add; `python tests/test_sizes.py` records lower numbers and new folders"
+    assert not found, "\n".join([*found, advice])
+
+
+def test_a_room_that_grows_is_found_and_lower_numbers_are_recorded() -> None:
+    held = {"total": 30, "old": 20, "gone": 10}
+    assert grown({"total": 30, "old": 21, "new": 9}, held) == ["old: 21 lines, at most 20"]
+    assert grown({"total": 31, "old": 20, "new": 11}, held) == ["total: 31 lines, at most 30"]
+    assert lowered({"total": 31, "old": 15, "new": 11}, held) == {"total": 30, "old": 15, "new": 11}
+
+
+if __name__ == "__main__":
+    held = json.loads(SIZES.read_text(encoding="utf-8")) if SIZES.exists() else {}
+    SIZES.write_text(json.dumps(lowered(lines_of_package(), held), indent=1) + "\n", encoding="utf-8")

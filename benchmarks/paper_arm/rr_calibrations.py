@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 
 import torch
 from rr_arm import COORDINATES, ExtendedArm, extended
-from rr_models import Criterion, Linearised, Recipe, around, linearise, search
+from rr_models import Criterion, Linearised, Recipe, around, linearise, log_likelihood, search
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from math import log, pi
 
 import numpy as np
 import torch
 from rr_arm import COORDINATES, JOINTS, LOADED, LOADS, ExtendedArm, extended
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
 from diffeo_calib.kernels.radial import Gaussian, RadialKernel
@@ -116,7 +116,7 @@ class Linearised:
 
     def inner(self, recipe: Recipe, vector: Tensor, weights: Tensor) -> Tensor:
         """sum(weights * matrix), differentiable in the scales."""
-        fields = replace(self.lin, spec=recipe.spec(vector)).inner(weights)
+        fields = (weights * replace(self.lin, spec=recipe.spec(vector)).gram()).sum()
         return fields + recipe.scales(vector)["noise"][0] ** 2 * weights.trace()
 
     def take(self, rows: Tensor) -> Linearised:
@@ -136,6 +136,16 @@ def around(recipe: Recipe, vector: Tensor, theta: Tensor, x: Tensor, y: Tensor) 
     """The model around theta, at the data."""
     lin = linearise(recipe, vector, theta, x)
     return Linearised(lin, theta, y - recipe.arm(extended(x), theta) + lin.sensitivity @ theta)
+
+
+def log_likelihood(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None]:
+    """log N(target; 0, matrix), and its derivative by the matrix; None if that is not positive definite in float64."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    if int(info):
+        return -float("inf"), None
+    mu = torch.cholesky_solve(target[:, None], factor)[:, 0]
+    value = -0.5 * float(target @ mu) - float(factor.diagonal().log().sum()) - 0.5 * len(target) * log(2 * pi)
+    return value, torch.cholesky_inverse(factor).addr_(mu, mu, beta=-0.5, alpha=0.5)
 
 
 def leave_one_out(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None]:

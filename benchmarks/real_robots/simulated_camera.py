@@ -12,8 +12,6 @@ import diffeo_calib as dc
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.measurements.pose_frames import inverse_poses
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -43,6 +41,23 @@ BOARD_PRIOR = BoardPrior(scale=2e-4)
 """Of a print that was measured with a caliper."""
 FEWEST_SEEN = 12
 """Corners of an image that is used."""
+LEVER = 0.1
+MARKS = torch.tensor(
+    [[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64, device=HOST
+)
+"""Three marks around a frame, at LEVER m from its origin, carry its pose: the simulated arm knows points alone."""
+
+
+def marks_of(poses: Tensor) -> Tensor:
+    """Marks (..., 3, 3) of poses (..., 4, 4), one per row, m."""
+    return poses[..., None, :3, 3] + LEVER * MARKS @ poses[..., :3, :3].mT
+
+
+def poses_of(marks: Tensor) -> Tensor:
+    """Poses (..., 4, 4) that marks (..., 3, 3) carry, m."""
+    x = torch.nn.functional.normalize(marks[..., 0, :] - marks.mean(-2), dim=-1)
+    y = torch.nn.functional.normalize(marks[..., 1, :] - marks[..., 2, :], dim=-1)
+    return transforms(torch.stack([x, y, torch.linalg.cross(x, y)], -1), marks.mean(-2))
 
 
 @dataclass(frozen=True)
@@ -60,7 +75,7 @@ class CameraArm:
         shifts, turns = (torch.randn(N, 3, dtype=dtype, device=HOST, generator=seeded(k)) for k in (5, 6))
         seen = rotation(rotation_std * turns) @ self.boards[:, :3, :3]
         boards = transforms(seen, self.boards[:, :3, 3] + position_std * shifts)
-        poses = boards if on_tool else inverse_poses(boards)
+        poses = boards if on_tool else torch.linalg.inv(boards)
         return dc.Measurements.from_poses(self.q, poses, self.arm.nominal.joint_names, camera_on_tool=on_tool)
 
     def images(self, noise_px: float, *, on_tool: bool = True, seed: int = 7) -> dc.Measurements:
@@ -114,8 +129,8 @@ def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *, secon
     camera = transforms(rotation(given[None, 3:]), given[None, :3])
     base = torch.eye(4, dtype=torch.float64, device=HOST)
     base[:3, 3] = -torch.tensor(BOARD, dtype=torch.float64, device=HOST)
-    arm.truth = replace(arm.truth, base=base, tool=mark_points(camera, LEVER)[0])
-    seen_boards = _seen(arm, rows, seed, lambda points: inverse_poses(poses_from_marks(points, LEVER)))
+    arm.truth = replace(arm.truth, base=base, tool=marks_of(camera)[0])
+    seen_boards = _seen(arm, rows, seed, lambda points: torch.linalg.inv(poses_of(points)))
     return CameraArm(arm, *seen_boards, true_camera(print_seed, SECOND_LENS if second else LENS))
 
 
@@ -131,8 +146,8 @@ def fixed_camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *,
     base[:3, :3], base[:3, 3] = R, -R @ place
     on_flange = torch.eye(4, dtype=torch.float64, device=HOST)
     on_flange[:3, 3] = torch.tensor(BOARD_ON_FLANGE, dtype=torch.float64, device=HOST)
-    arm.truth = replace(arm.truth, base=base, tool=mark_points(on_flange[None], LEVER)[0])
-    seen_boards = _seen(arm, rows, seed, lambda points: poses_from_marks(points, LEVER))
+    arm.truth = replace(arm.truth, base=base, tool=marks_of(on_flange))
+    seen_boards = _seen(arm, rows, seed, poses_of)
     return CameraArm(arm, *seen_boards, true_camera(print_seed, SECOND_LENS if second else LENS))
 
 
@@ -157,7 +172,7 @@ def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor],
         boards = boards_of(arm.true_points(q))
         away = boards[:, :3, 3].norm(dim=1)
         ahead = boards[:, 2, 3] > VIEW * away
-        above = inverse_poses(boards)[:, 2, 3] > 0.15
+        above = torch.linalg.inv(boards)[:, 2, 3] > 0.15
         seen = ahead & above & (away > NEAR) & (away < FAR)
         found.append((q[seen], boards[seen]))
         if sum(len(part) for part, _ in found) >= rows:

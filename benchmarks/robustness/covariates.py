@@ -45,9 +45,9 @@ from robot_data import data_folder
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import COUPLED_PROFILE
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.process.scales import COUPLED_PROFILE
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.tree import Tree
 
@@ -84,7 +84,7 @@ class Split:
         noise = self.data.weighted_noise(self.scales)
         self.noise = torch.block_diag(*noise)
         self.new_noise = noise[len(train) :] if truth is None else torch.zeros_like(noise[len(train) :])
-        self.prior = self.data.covariance_terms(self.scales).matrix() - self.noise
+        self.prior = self.data.linearisation(self.scales).gram()
         self.rows, self.width = len(train), places.shape[1]
         self.fit = slice(0, self.rows * self.width)
         self.new = slice(self.rows * self.width, None)

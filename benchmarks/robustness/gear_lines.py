@@ -38,12 +38,12 @@ from diffeo_calib.calibration import choose_scales
 from diffeo_calib.calibration.diagnostics.plausibility import registered
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.process.scales import GearLine, Hyperparameters
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.tree import Tree
 
@@ -97,7 +97,8 @@ def drawn(poses: int, draws: int) -> Record:
     """Share of scans with a line on measurements that are drawn from the model itself."""
     arm = SimulatedArm(0)
     data, scales = tangent(arm.nominal, dc.Measurements(*arm.measure(poses, seed=1000)))
-    factor = torch.linalg.cholesky(data.covariance_terms(scales).matrix())
+    total = data.linearisation(scales).gram() + torch.block_diag(*data.weighted_noise(scales))
+    factor = torch.linalg.cholesky(total)
     generator, wrong = torch.Generator().manual_seed(0), 0
     for _ in range(draws):
         noise = torch.randn(len(factor), dtype=factor.dtype, generator=generator)

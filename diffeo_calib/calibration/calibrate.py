@@ -40,7 +40,6 @@ from diffeo_calib.calibration.placing.drift import worth_it
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.of_models import check_models
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
@@ -57,6 +56,7 @@ from diffeo_calib.kinematics.provenance import Provenance, Summary, check_note
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
@@ -299,7 +299,7 @@ def _summary(
         diffeomorphic_rms=calibrated,
         leave_one_out_rms=left_out,
         outliers=len(found),
-        noise_degrees_of_freedom=chosen.data.tails.freedom,
+        gross_share=chosen.data.tails.share,
         coupling_residual=fitted.coupling_residual,
         end_residual=fitted.end_residual,
         energy=fitted.energy,

@@ -26,7 +26,6 @@ from diffeo_calib.calibration.scales.cross_validation import cross_validated_inf
 from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     estimate_tails,
@@ -42,6 +41,8 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import SMALLER, reweight
 
 
 @dataclass(frozen=True)
@@ -233,10 +234,13 @@ def _selected(
 ) -> tuple[Selection, TangentData]:
     """Scales by marginal likelihood, and the measurements with the weights that follow."""
     first = select(centre, data, seed=seed, progress=progress)
-    data = data.with_tails(estimate_tails(data, first.scales, seed))
+    # Left-out errors: scales that were chosen with gross errors among the rows let the fields explain them.
+    squares = leave_one_out(data, first.scales, seed).squares
+    data = data.with_tails(reweight(squares, data.noise_model.freedom, SMALLER))
     if first.interrupted:
         return first, data
-    second = select(centre, data, start=first.scales, seed=seed, progress=progress)
+    start = None if data.tails.share else first.scales
+    second = select(centre, data, start=start, seed=seed, progress=progress)
     scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
     return replace(second, scales=scales), data
@@ -294,9 +298,9 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     sag = data.nominal.elasticity
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
-    some = data.sample(POSES, COORDINATES, seed)[1].told
+    some = data.sample(POSES, COORDINATES, seed)[1]
     tried = [replace(scales, payload=factor) for factor in FACTORS]
-    return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))
+    return max(tried, key=lambda one: some.process(one).evidence)
 
 
 RESIDUAL_TOLERANCE = 1e-5

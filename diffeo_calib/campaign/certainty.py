@@ -20,11 +20,11 @@ from math import inf, isinf
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SCALE_PRIOR
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.posterior import Rows
 from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.process.scales import Hyperparameters
 
 EXCEEDANCE_PROBABILITY = 0.05
 """Probability that the true error is above the limit."""

@@ -17,10 +17,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import NOISE_ADVICE
 
 

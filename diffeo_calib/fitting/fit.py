@@ -84,7 +84,7 @@ def fit(
             with the same data, and later the same queries to the model.
         accuracy: allows large kernel sums an error of this size, relative to the sum of the momenta's absolute values:
             for smooth kernels of few coordinates they then go by plane waves, in a time that grows with the number of
-            points, not of pairs, and those of short kernels over nearby pairs. Default: all pairs.
+            points, not of pairs. Default: all pairs.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
         formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed

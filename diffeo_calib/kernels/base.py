@@ -118,14 +118,6 @@ class Kernel(ABC):
         blocks = [e @ self.gram(q, eye, q, e[None]) for q, e in zip(together, effect, strict=True)]
         return torch.stack(blocks) if blocks else effect @ effect.mT
 
-    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
-        """sum(weights * gram(x, left, y, right)), differentiable in the hyper-parameters: scalar.
-
-        Args:
-            weights: (M k, N l); the other arguments are those of :meth:`gram`.
-        """
-        return (weights * self.gram(x, left, y, right)).sum()
-
     def check(self, dim: int, name: str) -> None:
         """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates.
 
@@ -228,14 +220,6 @@ class DiagonalKernel(Kernel):
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
         """Yield k and K(x_i, y_j)_kk (N, M), differentiable, for every component k that is not always zero."""
 
-    @abstractmethod
-    def inner_by_component(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-        """sum_ijk weights_ikj K(x_i, y_j)_kk for weights (M, n, N): scalar."""
-
-    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
-        """sum(weights * gram(x, left, y, right)) without the large matrix: scalar."""
-        return self.inner_by_component(x, y, contracted(weights, left, right))
-
 
 class SumKernel(Kernel):
     """A sum of kernels; its fields are the sums of theirs."""
@@ -310,15 +294,6 @@ class SumKernel(Kernel):
     def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
         """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k)."""
         return _total(t.own_blocks(x, effect) for t in self.terms)
-
-    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
-        """sum(weights * gram(x, left, y, right)): scalar."""
-        diagonal, rest = self._split
-        parts = [t.inner(x, left, y, right, weights) for t in rest]
-        if diagonal:
-            by_component = contracted(weights, left, right)
-            parts = [t.inner_by_component(x, y, by_component) for t in diagonal] + parts
-        return _total(parts)
 
     @property
     def _split(self) -> tuple[list[DiagonalKernel], list[Kernel]]:
@@ -402,10 +377,3 @@ def component_gram(components: Iterable[tuple[int, Tensor]], left: Tensor, right
         return left.new_zeros(M * k, N * r)
     effect = right.reshape(N, r, -1, n)[..., present].flatten(2)
     return diagonal_gram(torch.stack([sums[c] for c in present], 1), left[..., present], effect)
-
-
-def contracted(weights: Tensor, left: Tensor, right: Tensor) -> Tensor:
-    """sum_kl weights_(ik)(jl) left_ikc right_jlc, the weights of a kernel's components: (M, n, N)."""
-    (M, k, n), (N, r, _) = left.shape, right.shape
-    half = (left.mT @ weights.view(M, k, N * r)).view(M, n, N, r)
-    return torch.einsum("icjr,jrc->icj", half, right)

@@ -294,16 +294,6 @@ class RadialKernel(DiagonalKernel):
         for component in range(n) if self.output is None else (self.output,):
             yield component, variances[component] * kappa
 
-    def inner_by_component(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-        """sum_ijk weights_ikj K(x_i, y_j)_kk for weights (M, n, N): scalar."""
-        lift = self._features(x.shape[-1]).lift
-        kappa = backends.profile_matrix(self.profile, lift(x), lift(y))
-        if self.output is not None:
-            return self.variance * (weights[:, self.output] * kappa).sum()
-        if not self.variance.ndim:
-            return self.variance * (weights.sum(1) * kappa).sum()
-        return (torch.einsum("k,ikj->ij", self.variance, weights) * kappa).sum()
-
 
 def scalar_or_vector(value: object) -> tuple[str, ...]:
     """Shape pattern for a value that may be one number or a vector of any length."""

@@ -45,16 +45,6 @@ class NodeSensitivity:
         shaped = mu.reshape(len(self.effect), -1, mu.shape[-1])  # (N, m, c) or (N P, d, c)
         return (self.effect.mT @ shaped).reshape(len(self.points), -1, mu.shape[-1])
 
-    def by_point(self) -> Tensor:
-        """The effect of every point by itself: (L Q, r, k)."""
-        return self.effect.unflatten(2, (self.together, -1)).transpose(1, 2).flatten(0, 1)
-
-    def spread(self, weights: Tensor) -> Tensor:
-        """Weights (L r, L r) of ends for their points by themselves: (L Q r, L Q r)."""
-        (L, r, _), Q = self.effect.shape, self.together
-        both = weights.view(L, 1, r, L, 1, r).expand(L, Q, r, L, Q, r)
-        return both.reshape(L * Q * r, L * Q * r)
-
     def gram(self, kernel: Kernel, other: NodeSensitivity) -> Tensor:
         """weight * effect K other.effect^T: (L r, L' r')."""
         if self.together == 1:
@@ -161,20 +151,6 @@ class Linearisation:
         for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
             for node in nodes:
                 total = total + node.weight * kernel.own_blocks(node.points, node.effect)
-        return total
-
-    def inner(self, weights: Tensor) -> Tensor:
-        """sum(weights * gram()), weights (M m, M m), differentiable in the scales of kernels and prior: scalar.
-
-        With the gradient of a function of gram() as weights, its derivative is that of the function, but autograd
-        records no matrix of this size.
-        """
-        S = self.sensitivity.flatten(0, 1)
-        total = ((weights @ S) * S).sum(0) @ self.spec.prior_variance
-        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
-            for node in nodes:
-                inner = kernel.inner(node.points, node.by_point(), node.points, node.by_point(), node.spread(weights))
-                total = total + node.weight * inner
         return total
 
     def rows(self, rows: Tensor) -> Linearisation:

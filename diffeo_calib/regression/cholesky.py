@@ -1,9 +1,8 @@
-"""Conditioning by one Cholesky factor of G + R: momenta, marginal likelihood, leave-one-out errors."""
+"""Conditioning by one Cholesky factor of G + R: momenta, leave-one-out errors."""
 
 from __future__ import annotations
 
 from functools import cached_property
-from math import log, pi
 
 import torch
 from torch import Tensor
@@ -52,12 +51,6 @@ class CholeskyRegression(DataConditional):
     def of_white(self, values: Tensor) -> Tensor:
         """L^-T values: (S,) -> (N m,)."""
         return self.spread(torch.linalg.solve_triangular(self.factor.T, values[:, None], upper=True)[:, 0])
-
-    def log_marginal_likelihood(self, target: Tensor) -> Tensor:
-        """log N(target; 0, G + R) of what was measured, scalar."""
-        quadratic = (target * self.mu(target)).sum()
-        log_det = 2.0 * torch.diagonal(self.factor).log().sum()
-        return -0.5 * (quadratic + log_det + len(self.factor) * log(2.0 * pi))
 
     @cached_property
     def inverse(self) -> Tensor:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.common.quantiles import chi2_above, f_below
 
 CONFIDENCE = 0.95
 SCALES = np.exp(np.linspace(np.log(0.05), np.log(200.0), 120))
@@ -82,6 +82,11 @@ def region_scale(
     number = float(shares.sum())
     own = _log_quantile(values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims]), shares)
     return float(np.exp((number * own + prior.rows * high) / (number + prior.rows)))
+
+
+def region_factor(freedom: float, dim: int) -> float:
+    """Factor for the 95 % region in ``dim`` coordinates of a variance estimated with ``freedom`` degrees of freedom."""
+    return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 
 def _log_quantile(ratios: np.ndarray, shares: np.ndarray) -> float:

@@ -25,8 +25,8 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import GearLine
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.process.scales import GearLine
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -238,9 +238,9 @@ def tails(result: Result) -> Numbers:
         known, rows = result.identification.tails, [found.row for found in result.outliers]
         return {"outliers": one(*rows), "geometry, weights": known.weights}
     return {
-        "tails, inverse freedom": one(1 / result.tails.freedom),
+        "tails, share": one(result.tails.share),
         "tails, weights": result.tails.weights,
-        "geometry, inverse freedom": one(1 / result.identification.tails.freedom),
+        "geometry, share": one(result.identification.tails.share),
         "geometry, weights": result.identification.tails.weights,
         "outliers": one(*(row for found in result.outliers for row in (found.row, found.marker or 0))),
     }

@@ -20,9 +20,9 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots import DHRow, Geometry, SimulatedArm
 from diffeo_calib.robots.tree import Tree
 
@@ -105,11 +105,20 @@ def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyper
 def weighted(setting: Setting, seed: int = 0) -> TangentData:
     """The same measurements with weights of any size, and a nominal map that sags under gravity."""
     data = setting.tangent_data
-    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape)))
+    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.0, tuple(data.tails.weights.shape)))
     theta = data.theta.clone()
     coefficients = slice(data.nominal.geometry.size, None)
     theta[coefficients] = 1e-3 * normal(len(theta[coefficients]), seed=seed)
-    return replace(data, theta=theta, tails=Tails(4.0, weights))
+    return replace(data, theta=theta, tails=Tails(0.1, 100.0, weights))
+
+
+def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
+    """Of all numbers of the rows, hidden ones too, by fields, unknowns, shared shifts and noise: (N m, N m)."""
+    total = data.linearisation(scales).gram() + torch.block_diag(*data.weighted_noise(scales))
+    if data.shared is not None:
+        shared = data.shared.flatten(0, 1)
+        total = total + shared @ shared.T
+    return total
 
 
 # --- formulas -----------------------------------------------------------------------------------------------------

@@ -47,9 +47,9 @@ def robot(folder: Path) -> dc.Tree:
 class TwoArms:
     """The robot with geometric and transmission errors, and a device that measures both hands."""
 
-    def __init__(self, nominal: dc.Tree, noise: float = 2e-5) -> None:
+    def __init__(self, nominal: dc.Tree, noise: float = 2e-5, seed: int = 4) -> None:
         self.nominal, self.noise = nominal, noise
-        self.rng = np.random.default_rng(4)
+        self.rng = np.random.default_rng(seed)
         placed = Geometry.nominal(nominal, 2, HANDS)
         theta = self.drawn(placed.size) * 1e-3
         theta[:6] = torch.tensor([0.5, -0.3, 0.8, 0.4, 0.2, 1.0], dtype=torch.float64)

@@ -9,7 +9,6 @@ from covariates import Split
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 TRAIN, ROWS = 60, 90
@@ -33,10 +32,12 @@ def test_a_drift_is_found_and_a_shuffled_time_is_not() -> None:
     assert ratio > 30.0
     assert model.likeliest("frame, linear", shuffled)[0] < 10.0
     assert model.predicted(further, known=True)[0] < 0.9 * model.without[0]
-    # the likelihood of the search for scales, and the normal equations of the regression, are the second way
+    # densities of torch, and the normal equations of the regression, are the second way
     whole = model.prior + model.noise
     matrices = [(whole + scale * further)[model.fit, model.fit].contiguous() for scale in (0.0, 1.0)]
-    plain, drifting_too = (log_likelihood(matrix, model.target[model.fit])[0] for matrix in matrices)
+    target = model.target[model.fit]
+    normals = (torch.distributions.MultivariateNormal(torch.zeros_like(target), matrix) for matrix in matrices)
+    plain, drifting_too = (float(one.log_prob(target)) for one in normals)
     assert ratio == pytest.approx(2 * (drifting_too - plain), rel=1e-8)
     for known in (True, False):
         across = (model.prior + known * further)[model.new, model.fit]

@@ -20,11 +20,10 @@ from kernel_choices import CHOICES, MODELS
 from rr_arm import BASE, COORDINATES, ExtendedArm, extended
 from rr_calibrations import Calibrated, Predict, calibrate, geometric_fit
 from rr_methods import METHODS, NAMES, OURS, PAPER, PROCESS
-from rr_models import LONGEST, around, leave_one_out
+from rr_models import LONGEST, around, leave_one_out, log_likelihood
 from sample_efficiency import Case
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 

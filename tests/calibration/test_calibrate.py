@@ -11,10 +11,10 @@ from product_bank import Case, calibrated, simulated, usual_scales
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import SCALES
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.process.scales import SCALES
 
 CERTIFICATE = 1e-4
 
@@ -77,7 +77,7 @@ def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
     left_out = result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
     assert summary.leave_one_out_rms == pytest.approx(float(left_out), rel=1e-9)
     assert summary.parts == {part.name: part.displacement for part in result.parts}
-    assert summary.noise_degrees_of_freedom == result.tails.freedom
+    assert summary.gross_share == result.tails.share
     assert summary.effective_parameters == result.leave_one_out.effective
     assert (summary.rows, summary.outliers) == (60, 0)
     assert summary.scales == result.selection.status

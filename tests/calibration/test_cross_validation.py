@@ -9,7 +9,7 @@ import pytest
 import torch
 from product_bank import simulated
 from scipy.stats import chi2
-from tangent_bank import Setting, built, normal, weighted
+from tangent_bank import Setting, built, covariance, normal, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -24,8 +24,8 @@ from diffeo_calib.calibration.scales.cross_validation import (
 )
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails, region_factor
-from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.regions import region_factor, region_scale
 from diffeo_calib.robots import SimulatedArm
 
 BRIEF = FoldLimits(iterations=1)
@@ -49,11 +49,11 @@ def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
     data, new = whole.told, whole.blocks_in_numbers(noise_of_new_rows(whole, scales))
     m = data.y.shape[1]
     inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
-    K, y = data.covariance_terms(scales).matrix(), data.target.flatten()
+    K, y = covariance(data, scales), data.target.flatten()
     gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
     errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
-    covariance = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
-    own = torch.stack([covariance[k, :, k] for k in range(3)])
+    spread = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
+    own = torch.stack([spread[k, :, k] for k in range(3)])
     part = data.rows(rows)
     predicted = own - part.weighted_noise(scales) + new[rows]
     expected = part.noise_model.squares(predicted, errors @ errors.mT)
@@ -104,7 +104,7 @@ def test_repeats_stay_in_one_fold() -> None:
 def drawn(setting: Setting, seed: int) -> TangentData:
     """Measurements of a robot that the scales describe exactly."""
     data = setting.tangent_data
-    factor = torch.linalg.cholesky(data.covariance_terms(setting.scales).matrix())
+    factor = torch.linalg.cholesky(covariance(data, setting.scales))
     target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
     return data.with_measured(data.y + target - data.target)
 
@@ -136,7 +136,7 @@ def test_outliers_hardly_change_the_factor() -> None:
     y[3] += 5e-3
     weights = torch.ones_like(clean.tails.weights)
     weights[3] = 1e-5
-    wrong = clean.with_measured(y).with_tails(Tails(4.0, weights))
+    wrong = clean.with_measured(y).with_tails(Tails(0.05, 1e5, weights))
     before, after = (
         cross_validated_inflation(setting.scales, setting.scales, data, groups(data), limits=BRIEF)
         for data in (clean, wrong)

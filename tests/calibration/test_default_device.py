@@ -32,7 +32,7 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import SearchLimits, defaults, log_posterior, select
-from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.process.tails import Tails, reweight
 
 pytestmark = pytest.mark.slow  # several calibrations
 
@@ -144,7 +144,7 @@ def test_diagnostics(measured: Measured) -> None:
     same(work)
 
 
-def test_student_t() -> None:
+def test_gross_errors() -> None:
     squares = normal(20, 2, seed=3).square()
     same(lambda: reweight(squares, 3))
     same(lambda: Tails.none(3, 2))
@@ -159,9 +159,10 @@ def test_tangent_data(measured: Measured) -> None:
     def work() -> list[Any]:
         data = replace(measured.tangent_data)
         rows, some = data.sample(10, 900, 5)
-        terms = data.covariance_terms(scales)
-        parts = [rows, some.target, terms.matrix(), data.factorised(scales).factor]
-        return [*parts, terms.inner(terms.matrix()), sensor.squares(data.noise(scales), moments)]
+        process, values = data.process(scales), data.pairs.values(scales)
+        inner = data.pairs.inner(values, process.inverse)
+        found = [process.mu, process.evidence, process.estimate, process.covariance, process.inverse, inner]
+        return [rows, some.target, *found, sensor.squares(data.noise(scales), moments)]
 
     same(work)
     same(lambda: NoiseModel.of(measured.data, 1e-4).covariance(scales, measured.tangent_data.jacobian))
@@ -173,7 +174,7 @@ def test_scales(measured: Measured) -> None:
     scales = measured.scales
 
     def work() -> list[Any]:
-        derived = [scales.geometry_only(), scales.inflated(1.5), scales.supported(data.jacobian, data.noise(scales))]
+        derived = [scales.inflated(1.5), scales.supported(data.jacobian, data.noise(scales))]
         return [scales.amplitudes(), scales.prior_variance(data.nominal), *(vars(s) for s in derived)]
 
     same(lambda: [part if isinstance(part, Tensor) else list(part.values()) for part in work()])
@@ -195,7 +196,7 @@ def test_tails_and_leave_one_out(measured: Measured) -> None:
 def test_change_points(measured: Measured) -> None:
     data, scales = measured.tangent_data, measured.scales
     effects, order = normal(16, data.y.shape[1], 4, seed=6), torch.arange(16)
-    same(lambda: list(find_change_point(effects, data.factorised(scales), data.target, order, 3)))
+    same(lambda: list(find_change_point(effects, data.process(scales), order, 3)))
 
 
 def test_the_choice_of_scales(measured: Measured) -> None:

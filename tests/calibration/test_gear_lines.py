@@ -6,18 +6,19 @@ from math import pi
 
 import pytest
 import torch
+from tangent_bank import covariance
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
@@ -73,7 +74,7 @@ def test_the_scan_is_that_of_least_squares() -> None:
     """Against dense generalised least squares, at frequencies of the scan and between them."""
     data, scales = drawn()
     scan = _Scan(data, scales, LIMITS)
-    K = data.covariance_terms(scales).matrix()
+    K = covariance(data, scales)
     whiten = torch.linalg.inv(torch.linalg.cholesky(K))
     r = whiten @ data.target.flatten()
     for joint in (0, 3):

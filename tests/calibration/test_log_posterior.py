@@ -10,11 +10,10 @@ import pytest
 import torch
 from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
-from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, SCALES
-from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, ScalePrior, log_likelihood, log_posterior
+from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, ScalePrior, log_posterior
+from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.robots import SimulatedArm
 
 
@@ -99,32 +98,6 @@ def test_prior_of_amplitudes_lets_them_shrink(prior: ScalePrior) -> None:
             if bool(shrinks[entry]):
                 width = prior.growth if step > 0 else prior.shrinkage
             assert found.prior == pytest.approx(-0.5 * (step / width) ** 2, rel=1e-9)
-
-
-# --- the likelihood -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("count", [1, 7, 30])
-def test_log_likelihood_and_its_slope(count: int) -> None:
-    root, target = normal(count, count, seed=1), normal(count, seed=2)
-    matrix = root @ root.mT + 0.3 * torch.eye(count, dtype=torch.float64)
-    value, slope = log_likelihood(matrix, target)
-    assert value == pytest.approx(log_density(matrix, target))
-    live = matrix.clone().requires_grad_()
-    other = torch.distributions.MultivariateNormal(torch.zeros(count, dtype=torch.float64), live, validate_args=False)
-    (expected,) = torch.autograd.grad(other.log_prob(target), live)
-    assert slope is not None
-    assert_close(slope, (expected + expected.mT) / 2, rtol=1e-9, atol=1e-10)
-    away = normal(count, count, seed=3)
-    away, h = away + away.mT, 1e-6
-    change = (log_likelihood(matrix + h * away, target)[0] - log_likelihood(matrix - h * away, target)[0]) / (2 * h)
-    assert float((slope * away).sum()) == pytest.approx(change, rel=1e-6)
-
-
-def test_likelihood_of_an_indefinite_matrix() -> None:
-    value, slope = log_likelihood(-torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
-    assert value == -math.inf
-    assert slope is None
 
 
 # --- singular covariances -----------------------------------------------------------------------------------------

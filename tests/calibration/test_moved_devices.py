@@ -11,7 +11,7 @@ import pytest
 import torch
 from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import scales
-from tangent_bank import Setting, built, normal
+from tangent_bank import Setting, built, covariance, normal
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -69,9 +69,9 @@ def test_the_gain_is_that_of_the_definition() -> None:
     setting = Setting(arm.nominal, measurements)
     data, effects = setting.tangent_data, normal(24, 3, 4, seed=0)
     order = torch.from_numpy(np.random.default_rng(1).permutation(24))
-    inverse, r = torch.linalg.inv(data.covariance_terms(setting.scales).matrix()), data.target.flatten()
+    inverse, r = torch.linalg.inv(covariance(data, setting.scales)), data.target.flatten()
     for fewest in (5, 9):
-        best = find_change_point(effects, data.factorised(setting.scales), data.target, order, fewest)
+        best = find_change_point(effects, data.process(setting.scales), order, fewest)
         gains = []
         for row in range(fewest, 24 - fewest + 1):
             B = torch.zeros(24, 3, 4, dtype=torch.float64)
@@ -87,11 +87,10 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
     """Gains relative to what is unexplained: errors of ten times the size gain as much, those of a tenth less."""
     setting = built("two markers")
     data, order = setting.tangent_data, torch.arange(14)
-    dense = data.factorised(setting.scales)
 
     def gains(factor: float) -> Tensor:
-        y = data.y + (factor - 1.0) * data.target
-        found = findings(causes_of(data), dense, data.with_measured(y), order)
+        moved = data.with_measured(data.y + (factor - 1.0) * data.target)
+        found = findings(causes_of(data), moved.process(setting.scales), order)
         return torch.tensor([one.point.gain for one in found], dtype=torch.float64)
 
     assert_close(gains(1000.0), gains(100.0), rtol=1e-6, atol=0)

@@ -14,8 +14,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.noise_model import SLACK_SHARE, SMALLEST_NOISE_M, NoiseModel
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.measurements.poses import mark_jacobian, mark_points
+from diffeo_calib.process.tails import Tails
 
 LEVER = 0.15
 DRAWS = 20000

@@ -47,10 +47,10 @@ def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
 
     told, at = data.told, data.told.linearisation(posed.scales)
     basis = torch.block_diag(*data.basis) if data.basis is not None else torch.eye(len(target), dtype=torch.float64)
-    dense, gram = told.factorised(posed.scales), at.gram()
-    found = gram @ dense.mu(told.target).flatten()
+    process, gram = told.process(posed.scales), at.gram()
+    found = gram @ process.mu
     assert_close(found, basis.T @ mean, rtol=0, atol=1e-4 * float(mean.abs().max()))
-    explained = gram @ dense.solve(gram.view(*told.y.shape, -1)).flatten(0, 1)
+    explained = gram @ process.factor.solve(gram)
     largest = float((gram - explained).abs().max())
     assert_close(gram - explained, gram - basis.T @ covariance @ basis, rtol=0, atol=1e-3 * largest)
 

@@ -138,7 +138,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     assert devices is not None
     socket, own = devices.socket, devices.places.sockets.place[devices.socket] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
-    mu = tangent.rows(rest).factorised(scales).mu(tangent.rows(rest).target)
+    mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
     gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
     predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + tangent.y[gone] - tangent.target[gone]
     middles = {int(s): predicted[socket[gone] == s].mean(0) for s in socket[gone].unique()}
@@ -151,22 +151,23 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
 
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
+    from tangent_bank import covariance
+
     from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
     from diffeo_calib.calibration.scales.selection import defaults
-    from diffeo_calib.calibration.student_t import region_factor
+    from diffeo_calib.regression.regions import region_factor
 
     placed = place(arm.nominal, data, silent)
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
     assert data.socket is not None
     assert data.places is not None
-    L = tangent.factorised(scales).factor
-    K, r, total = L @ L.mT, tangent.target.flatten(), 0.0
+    K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
     for number in range(6):
         own = (data.places == number).repeat_interleave(3)
         gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
-        errors, covariance = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
-        total += float(errors @ torch.linalg.solve(covariance, errors))
+        errors, spread = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
+        total += float(errors @ torch.linalg.solve(spread, errors))
     ratio = total / (3 * len(data) - 3 * 12)
     assert ratio > 1.5, "scales that are too small"
     groups = data.groups()

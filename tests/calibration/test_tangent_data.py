@@ -9,16 +9,15 @@ from dataclasses import replace
 import pytest
 import torch
 from product_bank import simulated
-from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from tangent_bank import Setting, built, covariance, noise_covariance, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales import tangent_data
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots import SimulatedArm
 
 # --- covariances --------------------------------------------------------------------------------------------------
@@ -32,9 +31,6 @@ def test_covariance_and_target_are_those_written_out(setting: Setting, seed: int
         expected = tangent_covariance(scales, nominal, theta, x)
         scale = float(expected.abs().max())
         assert_close(data.linearisation(scales).gram(), expected, rtol=0, atol=1e-12 * scale)
-        noise = noise_covariance(scales, setting, theta, data.tails.weights)
-        expected += torch.block_diag(*noise)
-        assert_close(data.covariance_terms(scales).matrix(), expected, rtol=0, atol=1e-12 * scale)
         target = data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta
         assert_close(data.target, target, rtol=0, atol=1e-14)
 
@@ -48,46 +44,6 @@ def test_noise_is_that_written_out(setting: Setting) -> None:
         assert_close(actual, expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()))
 
 
-def test_the_search_sees_the_matrix_of_the_fit(setting: Setting) -> None:
-    """By all joints at once and by one kernel after the other."""
-    data, scales = weighted(setting), shaken(setting.scales, 7)
-    expected = data.factorised(scales).factor
-    matrix = data.covariance_terms(scales).matrix()
-    assert_close(matrix, matrix.mT, rtol=0, atol=1e-14 * float(matrix.abs().max()))
-    assert_close(matrix, expected @ expected.mT, rtol=0, atol=1e-13 * float(matrix.abs().max()))
-
-
-def test_inner_is_the_sum_with_the_whole_matrix(setting: Setting) -> None:
-    """And its derivative by the scales is that of the matrix."""
-    data = weighted(setting)
-    count = data.target.numel()
-    weights = normal(count, count, seed=4)
-    point = shaken(setting.scales, 3).logarithms()
-    terms = data.covariance_terms(setting.scales.from_logarithms(point))
-    value, matrix = float(terms.inner(weights)), terms.matrix()
-    size = float((weights * matrix).abs().sum())
-    assert value == pytest.approx(float((weights * matrix).sum()), abs=1e-12 * size)
-    live, other = point.clone().requires_grad_(), point.clone().requires_grad_()
-    inner = data.covariance_terms(setting.scales.from_logarithms(live)).inner(weights)
-    (gradient,) = torch.autograd.grad(inner, live)
-    scales = setting.scales.from_logarithms(other)
-    dense = (weights * Noise(data.weighted_noise(scales)).add_to(data.linearisation(scales).gram())).sum()
-    (expected,) = torch.autograd.grad(dense, other)
-    assert_close(gradient, expected, rtol=1e-9, atol=1e-12 * size)
-
-
-def test_prior_of_base_and_markers_is_that_of_the_data(setting: Setting) -> None:
-    """A narrow one lowers the covariance by what the places contribute."""
-    data, scales = setting.tangent_data, setting.scales
-    narrow = replace(data, place_deviation=1e-3)
-    geometry = data.nominal.geometry
-    places = [*range(*geometry.slices["base"].indices(geometry.size))]
-    places += range(*geometry.slices["tool"].indices(geometry.size))
-    S = data.sensitivities[..., places].flatten(0, 1)
-    change = data.covariance_terms(scales).matrix() - narrow.covariance_terms(scales).matrix()
-    assert_close(change, (0.1**2 - 1e-3**2) * S @ S.mT, rtol=0, atol=1e-11 * float(change.abs().max()))
-
-
 # --- parts and variants -------------------------------------------------------------------------------------------
 
 
@@ -95,18 +51,18 @@ def test_rows_are_those_of_the_whole(setting: Setting) -> None:
     data, rows = weighted(setting), torch.tensor([5, 0, 7])
     some, m = data.rows(rows), data.y.shape[1]
     index = (rows[:, None] * m + torch.arange(m)).flatten()
-    whole, part = data.covariance_terms(setting.scales).matrix(), some.covariance_terms(setting.scales).matrix()
+    whole, part = covariance(data, setting.scales), covariance(some, setting.scales)
     assert_close(part, whole[index][:, index], rtol=0, atol=1e-13 * float(whole.abs().max()))
     assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
 
 
 def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(setting: Setting) -> None:
     data = setting.tangent_data
-    covariance, target = data.covariance_terms(setting.scales).matrix(), data.target
+    target = data.target
     moved = data.with_measured(data.y + 1e-3)
     assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
-    assert_close(moved.covariance_terms(setting.scales).matrix(), covariance, rtol=0, atol=0)
-    halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
+    assert_close(moved.told.noise(setting.scales), data.told.noise(setting.scales), rtol=0, atol=0)
+    halved = data.with_tails(Tails(0.1, 100.0, torch.full_like(data.tails.weights, 0.5)))
     assert_close(halved.weighted_noise(setting.scales), 2 * data.noise(setting.scales))
     assert_close(halved.target, target, rtol=0, atol=0)
 
@@ -164,14 +120,13 @@ def test_k0_is_linearised_once() -> None:
     setting = built("two markers")
     data, count = counting(setting)
     for scales in (setting.scales, shaken(setting.scales, 1)):
-        data.covariance_terms(scales).matrix()
-        data.factorised(scales)
+        data.process(scales)
         data.noise(scales)
         part = data.rows(torch.tensor([3, 1]))
-        part.covariance_terms(scales).matrix()
-        data.with_tails(Tails.none(*data.tails.weights.shape)).covariance_terms(scales).matrix()
-        data.with_measured(data.y).covariance_terms(scales).matrix()
-        data.sample(5, 900, 0)[1].covariance_terms(scales).matrix()
+        part.process(scales)
+        data.with_tails(Tails.none(*data.tails.weights.shape)).process(scales)
+        data.with_measured(data.y).process(scales)
+        data.sample(5, 900, 0)[1].process(scales)
     assert count == dict.fromkeys(ONCE, len(data.x))
 
 
@@ -179,7 +134,7 @@ def test_rows_before_the_whole_is_needed_linearise_these_rows_only() -> None:
     data, count = counting(built("two markers"))
     some = data.rows(torch.tensor([3, 1]))
     assert not count
-    some.covariance_terms(built("two markers").scales).matrix()
+    some.process(built("two markers").scales)
     assert count == dict.fromkeys(ONCE, 2)
 
 
@@ -210,35 +165,28 @@ def test_a_calibration_linearises_every_pose_once_before_the_fit(monkeypatch: py
     assert seen["jacobian"] <= 3 * len(train)  # once by the tangent data, once at the start of the fit
 
 
-# --- matrices that are kept ---------------------------------------------------------------------------------------
+# --- what is kept ---------------------------------------------------------------------------------------------------
 
 
-def test_kept_matrices_are_those_of_their_scales_and_weights(setting: Setting) -> None:
-    """Whatever was asked for before: other scales, other weights, fewer rows."""
+def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
+    """Whatever was asked for before: other scales, other weights, other measurements, fewer rows."""
     first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
     kept, other = setting.tangent_data.with_tails(setting.tangent_data.tails), weighted(setting, 3)
-    orders = [(kept, first), (kept.with_tails(other.tails), first), (kept, second), (kept, first)]
-    for data, scales in orders:
-        fresh = replace(data)
-        size = float(fresh.gram(scales).abs().max())
-        assert_close(data.gram(scales), fresh.linearisation(scales).gram(), rtol=0, atol=1e-14 * size)
-        assert_close(data.factorised(scales).factor, fresh.factorised(scales).factor, rtol=0, atol=0)
+    kept.process(first)
     some = kept.rows(torch.arange(3))
-    assert some.gram(first).shape == (3 * kept.y.shape[1],) * 2
-    turned = kept.rows(torch.arange(len(kept.x)).flip(0))
-    expected = replace(turned).gram(first)
-    assert_close(turned.gram(first), expected, rtol=0, atol=0)
+    orders = [(kept.with_tails(other.tails), first), (kept, second), (kept, first), (some, first)]
+    for data, scales in [*orders, (kept.with_measured(kept.y + 1e-3), first)]:
+        assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
 
 
-def test_matrices_of_few_rows_are_computed_once(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_few_rows_say_is_computed_once(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
     scales, data = setting.scales, replace(setting.tangent_data)
-    assert data.factorised(scales) is data.factorised(scales)
-    assert data.with_tails(weighted(setting).tails).gram(scales) is data.gram(scales)
-    assert data.factorised(scales.inflated(1.0)) is not data.factorised(scales)
+    assert data.process(scales) is data.process(scales)
+    assert data.with_tails(weighted(setting).tails).expected(scales) is data.expected(scales)
+    assert data.process(scales.inflated(1.0)) is not data.process(scales)
     monkeypatch.setattr(tangent_data, "KEPT_COORDINATES", 1)
     many = replace(data)
-    assert many.factorised(scales) is not many.factorised(scales)
-    assert many.gram(scales) is not many.gram(scales)
+    assert many.process(scales) is not many.process(scales)
 
 
 def test_a_sample_of_all_rows_is_the_data_themselves(setting: Setting) -> None:

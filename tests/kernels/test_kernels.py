@@ -201,19 +201,6 @@ def test_gram_has_the_explicit_blocks(case: Case) -> None:
     torch.testing.assert_close(case.kernel.gram(x, left, y, right), torch.cat(rows), rtol=1e-12, atol=1e-13)
 
 
-@every_case
-def test_inner_product_with_weights(case: Case) -> None:
-    """sum_ij <W_ij, L_i K(x_i, y_j) R_j^T>, pair by pair."""
-    x, y = case.points(4, seed=1), case.points(3, seed=2)
-    left, right, weights = normal(4, 2, case.dim, seed=5), normal(3, 5, case.dim, seed=6), normal(8, 15, seed=7)
-    expected = torch.zeros((), dtype=torch.float64)
-    for i in range(4):
-        for j in range(3):
-            block = left[i] @ case.pair(x[i], y[j]) @ right[j].T
-            expected = expected + (weights[2 * i : 2 * i + 2, 5 * j : 5 * j + 5] * block).sum()
-    torch.testing.assert_close(case.kernel.inner(x, left, y, right, weights), expected, rtol=1e-12, atol=1e-12)
-
-
 BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "gaussian": lambda s, v: dc.Gaussian(s, v, space=MIXED),
     "matern-1.5": lambda s, v: dc.Matern(s, 1.5, v, space=MIXED),
@@ -233,29 +220,6 @@ def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) ->
     left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
     scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, v: build(s, v).gram(x, left, x, right), (scales, variance), atol=1e-7)
-
-
-@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
-def test_inner_product_has_the_gradients_of_gram(build: Callable[[Tensor, Tensor], Kernel]) -> None:
-    x, left, right = uniform(5, 3, seed=1), normal(5, 2, 3, seed=3), normal(5, 4, 3, seed=4)
-    weights, found = normal(10, 20, seed=5), []
-    for dense in (False, True):
-        scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
-        kernel = build(scales, variance)
-        value = (weights * kernel.gram(x, left, x, right)).sum() if dense else kernel.inner(x, left, x, right, weights)
-        found.append((value.detach(), *torch.autograd.grad(value, (scales, variance), materialize_grads=True)))
-    for actual, expected in zip(*found, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("output", [None, 1])
-def test_inner_product_with_one_variance_for_all(output: int | None) -> None:
-    x, left, weights = normal(5, 3, seed=1), normal(5, 2, 3, seed=2), normal(10, 10, seed=3)
-    scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
-    kernel = RadialKernel(GaussianProfile(), lengthscale=scale, variance=variance, output=output)
-    expected = torch.autograd.grad((weights * kernel.gram(x, left, x, left)).sum(), (scale, variance))
-    actual = torch.autograd.grad(kernel.inner(x, left, x, left, weights), (scale, variance))
-    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_scalar_hyper_parameter_gradients() -> None:

@@ -1,7 +1,7 @@
 """k1 = psi o k0 o phi^-1: its derivative, its limits, and its linearisation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -275,27 +275,6 @@ def test_linearisation_in_path_space(arm: Arm, where: str) -> None:
         errors.append(float((actual - expected).abs().max()))
     assert errors[-1] <= 1e-4 * float(expected.abs().max())
     assert slopes(errors)[0] >= 3.3
-
-
-@every_arm
-def test_inner_product_with_the_covariance(arm: Arm) -> None:
-    """sum(weights * gram()), and its derivatives by all scales of the prior."""
-    lin = arm.deform(0.2).linearise()
-    count = N * arm.outputs
-    weights, found = normal(count, count, seed=21), []
-    for dense in (False, True):
-        scales = tensor([0.9, 0.4]).requires_grad_()
-        joints, tasks = tensor([0.7] * arm.joints).requires_grad_(), tensor([0.5] * arm.spec.task_dim).requires_grad_()
-        prior = arm.spec.prior_variance.clone().requires_grad_()
-        joint = dc.Gaussian(scales[0], joints)
-        task = dc.Gaussian(scales[1], tasks) + dc.Matern(scales[0], 2.5, 0.3)
-        model = replace(arm.spec, joint_kernel=joint, task_kernel=task, prior_variance=prior)
-        live = replace(lin, spec=model)
-        value = (weights * live.gram()).sum() if dense else live.inner(weights)
-        slopes = torch.autograd.grad(value, (scales, joints, tasks, prior), materialize_grads=True)
-        found.append((value.detach(), *slopes))
-    for actual, expected in zip(*found, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-11)
 
 
 @every_arm

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.process.scales import Hyperparameters
 
 
 @dataclass(frozen=True)
@@ -96,17 +96,16 @@ def lengths(
             length. seed: draws the rows where there are too many. limits: what is usual.
     """
     rows, some = data.sample(len(data.x), limits.coordinates, seed)
-    told = some.told
-    dense, target = told.factorised(usual(scales, limits)), told.target
-    total, found = float((dense.mu(target) * target).sum()), []
+    process, numbers = some.process(usual(scales, limits)), some.numbers
+    total, found = float(process.mu @ numbers.target), []
     causes = (one._replace(effects=one.effects[rows]) for one in (*_directions(data, limits), *devices()))
     for cause in causes:
-        B, moved = cause.told_by(some).effects, cause.effects - cause.effects.mean(0)
-        W = dense.solve(B)
-        h, g = float((B * W).sum()), float((W[..., 0] * target).sum())
+        moved = cause.effects - cause.effects.mean(0)
+        B = numbers.of_table(cause.told_by(some).effects)[:, 0]
+        h, g = float(B @ process.factor.solve(B[:, None])[:, 0]), float(B @ process.mu)
         if h <= 0.0:
             continue
-        excess = max(1.0, (total - g**2 / h) / max(told.coordinates, 1))  # of errors that are not usual
+        excess = max(1.0, (total - g**2 / h) / max(len(numbers.target), 1))  # of errors that are not usual
         value, deviation = g / h, (excess / h) ** 0.5
         motion = float(moved[some.visible].square().mean().sqrt())
         chance = chi2_probability((value / deviation) ** 2, 1)

@@ -25,14 +25,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence
 from diffeo_calib.common.quantiles import chi2_median, chi2_probability
 from diffeo_calib.kinematics.nominal import rigid_motions
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.process.process import Process
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.se3 import skew
 
 RELATIVE_RIDGE = 1e-9
@@ -195,19 +194,19 @@ def change_during(
         return None
     least = limits.noise_share * float(some.new_noise(scales).diagonal().mean().sqrt())
     causes = _on_rows((*causes_of(data), *devices()), rows, some)
-    some, numbers = some.told, numbers.to(rows.device)[rows]
-    order, dense = numbers.argsort(), some.factorised(scales)
+    numbers, process = numbers.to(rows.device)[rows], some.process(scales)
+    order = numbers.argsort()
     usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
     excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
-    found = findings(causes, dense, some, order, excess=excess, limits=limits)
+    found = findings(causes, process, order, excess=excess, limits=limits)
     found = [one for one in found if one.displacement > least]
     if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
         return None
     best = max(found, key=lambda one: one.evidence)
     others = [one for one in found if one.cause.name != best.cause.name and _as_good(one, best, limits)]
     words = dict.fromkeys(one.words(limits) for one in (best, *others))
-    before, after = (left_out_rms(known, some.target) for known in (dense, Beside(dense, best.columns)))
-    if best.drifts and (moved := moved_twice(best, dense, some.target, order, limits)):
+    before, after = left_out_rms(process), left_out_rms(Beside(process, best.columns))
+    if best.drifts and (moved := moved_twice(best, process, order, limits)):
         lines = " and ".join(str(int(numbers[order[row]])) for row in moved)
         what = f"{best.cause.name} seems to have moved more than once, near rows {lines}"
         return sentence(what, expected="one set-up for all rows", fix=f"check what happened then; {best.cause.fix}")
@@ -229,33 +228,34 @@ def _on_rows(causes: Iterable[Cause], rows: Tensor, some: TangentData) -> list[C
 
 
 class Beside:
-    """K^-1 of rows beside changes of any size with these columns (N, m, U)."""
+    """Rows beside changes of any size with these columns (N, m, U): K^-1 and K^-1 target, as a process has them."""
 
-    def __init__(self, dense: CholeskyRegression, columns: Tensor) -> None:
-        U, H = dense.solve(columns).flatten(0, 1), _normal(columns, dense)
-        self.inverse = dense.inverse - U @ torch.linalg.pinv(H + _ridge(H), hermitian=True) @ U.T
-
-    def mu(self, target: Tensor) -> Tensor:
-        """K^-1 of numbers (N, m)."""
-        return (self.inverse @ target.flatten()).view_as(target)
+    def __init__(self, process: Process, columns: Tensor) -> None:
+        self.numbers, C = process.numbers, process.numbers.of_table(columns)
+        U, H = process.inverse @ C, C.T @ process.inverse @ C
+        self.inverse = process.inverse - U @ torch.linalg.pinv(H + _ridge(H), hermitian=True) @ U.T
+        self.mu = self.inverse @ self.numbers.target
 
 
 def moved_twice(
-    drift: Finding, dense: CholeskyRegression, target: Tensor, order: Tensor, limits: ChangeLimits = LIMITS
+    drift: Finding, process: Process, order: Tensor, limits: ChangeLimits = LIMITS
 ) -> tuple[int, int] | None:
     """First rows after two sudden changes of a cause that predict left-out rows better than its drift; else None.
 
     Three set-ups look like a drift. The first change point is sought once more beside the second one.
     """
-    effects, known, found = drift.cause.effects, dense, []
+    effects, known, found = drift.cause.effects, process, []
     for _ in range(3):
-        found.append(find_change_point(effects, known, target, order, limits.fewest_rows).row)
-        known = Beside(dense, _from_row(effects, order, found[-1]))
+        found.append(find_change_point(effects, known, order, limits.fewest_rows).row)
+        known = Beside(process, _from_row(effects, order, found[-1]))
     low, high = sorted(found[1:])
-    both = Beside(dense, torch.cat([_from_row(effects, order, row) for row in (low, high)], 2))
-    drifting = left_out_rms(Beside(dense, drift.columns), target)
+    both = Beside(process, torch.cat([_from_row(effects, order, row) for row in (low, high)], 2))
     apart = high - low >= limits.fewest_rows
-    return (low, high) if apart and left_out_rms(both, target) < limits.worth * drifting else None
+    return (
+        (low, high)
+        if apart and left_out_rms(both) < limits.worth * left_out_rms(Beside(process, drift.columns))
+        else None
+    )
 
 
 def _from_row(effects: Tensor, order: Tensor, row: int) -> Tensor:
@@ -272,29 +272,23 @@ def _as_good(one: Finding, best: Finding, limits: ChangeLimits) -> bool:
 
 
 def findings(
-    causes: Iterable[Cause],
-    dense: CholeskyRegression,
-    data: TangentData,
-    order: Tensor,
-    *,
-    excess: float = 1.0,
-    limits: ChangeLimits = LIMITS,
+    causes: Iterable[Cause], process: Process, order: Tensor, *, excess: float = 1.0, limits: ChangeLimits = LIMITS
 ) -> list[Finding]:
     """Every cause at its best change point, and drifting.
 
     Gains are divided by ``excess``, or by the mean square of what the cause leaves unexplained where that is larger.
     """
-    found, target = [], data.target
-    total, count = float((dense.mu(target) * target).sum()), max(data.coordinates, 1)
+    found, target = [], process.numbers.target
+    total, count = float(process.mu @ target), len(target)
 
     def judged(point: ChangePoint) -> ChangePoint:
         return point._replace(gain=point.gain / max(excess, (total - point.gain) / count))
 
     for cause in causes:
-        jump = find_change_point(cause.effects, dense, target, order, limits.fewest_rows)
+        jump = find_change_point(cause.effects, process, order, limits.fewest_rows)
         found.append(Finding(cause, judged(jump), False, _from_row(cause.effects, order, jump.row)))
         columns = evenly_growing(cause.effects, order)
-        found.append(Finding(cause, judged(_drift(cause.effects, columns, dense, target)), True, columns))
+        found.append(Finding(cause, judged(_drift(cause.effects, columns, process)), True, columns))
     return found
 
 
@@ -313,22 +307,21 @@ def evenly_growing(effects: Tensor, order: Tensor) -> Tensor:
     return ramp[:, None, None] * effects
 
 
-def _drift(effects: Tensor, columns: Tensor, dense: CholeskyRegression, target: Tensor) -> ChangePoint:
+def _drift(effects: Tensor, columns: Tensor, process: Process) -> ChangePoint:
     """The change from the first row to the last that explains most."""
-    g, H = torch.einsum("imu,im->u", columns, dense.mu(target)), _normal(columns, dense)
-    u = (torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g[..., None])[..., 0]  # noise-free rows leave H singular
+    C = process.numbers.of_table(columns)
+    g, H = C.T @ process.mu, C.T @ process.inverse @ C
+    u = torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g  # noise-free rows may leave H singular even so
     return ChangePoint(0, float(g @ u), u, effects)
 
 
-def left_out_rms(known: CholeskyRegression | Beside, target: Tensor) -> float:
+def left_out_rms(known: Process | Beside) -> float:
     """RMS of leave-one-out errors, m."""
-    blocks, mu = diagonal_blocks(known.inverse, len(target)), known.mu(target)
-    return float(torch.linalg.solve(blocks, mu[:, :, None])[..., 0].square().sum(1).mean().sqrt())
-
-
-def _normal(columns: Tensor, dense: CholeskyRegression) -> Tensor:
-    """B^T K^-1 B (U, U)."""
-    return torch.einsum("imu,imv->uv", columns, dense.solve(columns))
+    total = 0.0
+    for part, block in zip(known.numbers.parts, known.numbers.diagonal_blocks(known.inverse), strict=True):
+        mu = known.mu[part.numbers].view(*part.cells.shape, 1)
+        total += float(torch.linalg.solve(block, mu).square().sum())
+    return (total / len(known.numbers.q)) ** 0.5
 
 
 def _ridge(H: Tensor) -> Tensor:
@@ -361,26 +354,30 @@ def causes_of(data: TangentData) -> list[Cause]:
 
 
 def find_change_point(
-    effects: Tensor,
-    dense: CholeskyRegression | Beside,
-    target: Tensor,
-    order: Tensor,
-    fewest_rows: int = LIMITS.fewest_rows,
+    effects: Tensor, known: Process | Beside, order: Tensor, fewest_rows: int = LIMITS.fewest_rows
 ) -> ChangePoint:
     """The most likely change point.
 
     Args:
-        effects: (N, m, U) derivatives of the rows by the unknowns. dense: their covariance. target: (N, m) m.
+        effects: (N, m, U) derivatives of the rows by the unknowns. known: the rows.
         order: (N,) row numbers in the order of measurement.
         fewest_rows: smallest number of rows on either side.
     """
-    n, m, unknowns = effects.shape
-    half = torch.einsum("imu,imjk->iujk", effects, dense.inverse.view(n, m, n, m))
-    blocks = torch.einsum("iujk,jkv->ijuv", half, effects)[order][:, order]
-    H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
-    g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
+    (n, _, unknowns), owner = effects.shape, known.numbers.owner
+    E = known.numbers.of_table(effects)
+
+    def by_row(values: Tensor) -> Tensor:
+        """Sums over the numbers of each row, the last row first: (M, k) -> (N, k)."""
+        return values.new_zeros(n, values.shape[1]).index_add_(0, owner, values)[order].flip(0)
+
+    g = by_row(E * known.mu[:, None]).cumsum(0)
+    H = E.new_empty(n, unknowns, unknowns)  # of the last 1 ... N rows
+    for u in range(unknowns):
+        half = by_row(E[:, u, None] * known.inverse)  # (N, M)
+        for v in range(u + 1):
+            H[:, u, v] = H[:, v, u] = by_row((half * E[:, v]).T).cumsum(0).cumsum(1).diagonal()
     H = H + RELATIVE_RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
-    u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]  # noise-free rows may leave H singular
+    u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]
     gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
     count = int(gains.argmax()) + fewest_rows  # rows after the change point
     return ChangePoint(n - count, float(gains.max()), u[count - 1], effects)

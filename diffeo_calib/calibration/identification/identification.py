@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import marker_places
+from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree

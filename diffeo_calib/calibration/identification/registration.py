@@ -33,13 +33,13 @@ from diffeo_calib.calibration.identification.identification import (
     identify,
     in_mm,
 )
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, PLACES, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree

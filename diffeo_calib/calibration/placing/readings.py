@@ -27,12 +27,12 @@ from diffeo_calib.calibration.identification.identification import (
     weighed_fits,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of

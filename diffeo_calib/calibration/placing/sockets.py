@@ -35,7 +35,6 @@ from diffeo_calib.calibration.identification.registration import (
     socket_means,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
@@ -45,6 +44,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -276,18 +276,17 @@ class SocketDevices(DeviceSet):
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
         data, sockets, found = chosen.data, self.places.sockets, []
-        dense = data.factorised(chosen.selection.scales)
-        inverse, mu = dense.inverse, dense.mu(data.target)
-        ball = torch.arange(mu.numel(), device=mu.device).view(mu.shape)[:, -3:]
-        shared = mu.new_zeros(*mu.shape, 0) if data.shared is None else data.shared
+        numbers, process = data.numbers, data.process(chosen.selection.scales)
+        shared = numbers.S[:, data.sensitivities.shape[2] :]
         place = torch.where(self.socket == NO_SOCKET, NO_SOCKET, sockets.place[self.socket])
+        ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
-            rows = (place == number).nonzero()[:, 0]
-            index = ball[rows].flatten()
-            errors = torch.linalg.solve(inverse[index][:, index], mu[rows, -3:].flatten())
-            others = mu - (inverse[:, index] @ errors).view(mu.shape)  # (G + R)^-1 y without the place
-            errors = errors.view(-1, 3) + torch.einsum("nac,mbc,mb->na", shared[rows, -3:], shared, others)
-            predicted = data.y[rows, -3:] - errors
+            index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
+            index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
+            ((errors, _),) = process.left_out([index])
+            others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
+            errors = errors + shared[index] @ (shared.T @ others)
+            predicted = data.y[rows, -3:] - errors.view(-1, 3)
             found.append(PlaceErrors(name, len(rows), *_spread(predicted, self.socket[rows], sockets)))
         return tuple(found)
 

@@ -28,11 +28,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior, held_parameters
 from diffeo_calib.calibration.planning.sensors import Options, Scene
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, NumericalError, as_written, few
 from diffeo_calib.common.threads import large_work
@@ -44,6 +42,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_memory
 from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions

@@ -25,7 +25,6 @@ from diffeo_calib.calibration.planning.knowledge import (
 )
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import outside_inference_mode
@@ -35,6 +34,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
 SMALLEST_STROKE = 1e-9

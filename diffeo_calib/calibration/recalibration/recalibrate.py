@@ -38,7 +38,6 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     warn_of_moved_markers,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
@@ -48,6 +47,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.mounted import mounted_of

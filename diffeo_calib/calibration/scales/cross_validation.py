@@ -24,14 +24,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.differing_noise import noise_of_new_rows
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.regions import region_factor, region_scale
 
 
 @dataclass(frozen=True)
@@ -145,16 +143,12 @@ def inflation_by_places(
             coordinates share an unknown shift with: its socket.
         groups: (N,) a number for each configuration, the same for its repeats.
     """
-    dense = data.factorised(scales)
-    inverse, mu = dense.inverse, dense.mu(data.target)
-    coordinates = torch.arange(mu.numel(), device=mu.device).view(mu.shape)
+    process, owner = data.process(scales), data.numbers.owner
     total, count, places = 0.0, 0, place[place >= 0].unique()
-    for number in places:
-        rows = (place == number).nonzero()[:, 0]
-        seen = data.visible[rows]
-        index, errors = coordinates[rows][seen], mu[rows][seen]
-        total += float(errors @ torch.linalg.solve(inverse[index][:, index], errors))
-        count += len(index) - 3 * len(shared[rows].unique())
+    groups_of_numbers = [(place[owner] == number).nonzero()[:, 0] for number in places]
+    for number, index, (errors, _) in zip(places, groups_of_numbers, process.left_out(groups_of_numbers), strict=True):
+        total += float(errors @ process.mu[index])
+        count += len(index) - 3 * len(shared[place == number].unique())
     units = max(len(places), FEWEST_PLACES) + len(groups[place < 0].unique())
     return max(total / max(count, 1), 1.0) * region_factor(units, 3)
 
@@ -203,13 +197,15 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, parts: list[Ten
         (N, bodies); NaN for hidden markers, and for rows of no part.
     """
     new, data = data.blocks_in_numbers(noise_of_new_rows(data, scales)), data.told
-    m, dense, own = data.y.shape[1], data.factorised(scales), data.weighted_noise(scales)
-    inverse, mu = dense.inverse, dense.mu(data.target).flatten()
-    moments, predicted = own * nan, own.clone()
-    for rows in parts:
-        index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()
-        covariance = torch.linalg.inv(inverse[index][:, index])
-        errors = (covariance @ mu[index]).view(len(rows), m, 1)
-        predicted[rows] = diagonal_blocks(covariance, len(rows)) - own[rows] + new[rows]
-        moments[rows] = errors @ errors.mT
-    return data.noise_model.squares(predicted, moments)
+    numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
+    part = torch.full((len(data.x),), -1, device=data.x.device)
+    for number, rows in enumerate(parts):
+        part[rows] = number
+    groups = [(part[numbers.owner] == number).nonzero()[:, 0] for number in range(len(parts))]
+    errors, covariance = torch.full_like(numbers.target, nan), torch.zeros_like(process.inverse)
+    for group, (error, own_covariance) in zip(groups, process.left_out(groups), strict=True):
+        errors[group] = error
+        covariance[group[:, None], group] = own_covariance
+    e = numbers.in_table(errors)[:, :, None]
+    predicted = numbers.blocks_in_table(numbers.diagonal_blocks(covariance)) - own + new
+    return data.noise_model.squares(torch.where(part[:, None, None] < 0, own, predicted), e @ e.mT)

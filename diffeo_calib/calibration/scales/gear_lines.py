@@ -22,9 +22,9 @@ from math import log, pi
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kernels.base import contracted
+from diffeo_calib.process.covariance import joint_weights
+from diffeo_calib.process.scales import GearLine, Hyperparameters
 
 MEDIAN_OF_CHANCE = 2.0 * log(2.0)
 """Median of chi-squared with two degrees of freedom."""
@@ -76,7 +76,7 @@ def find_gear_lines(
     """
     if data.coordinates < limits.per_scale * len(scales.logarithms()):
         return ()
-    data = data.sample(len(data.x), limits.coordinates, seed)[1].told
+    data = data.sample(len(data.x), limits.coordinates, seed)[1]
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
     scan = _Scan(data, scales, limits)
     found: list[GearLine] = []
@@ -123,14 +123,16 @@ class _Scan:
         limits: ScanLimits,
         state: tuple[Tensor, Tensor] | None = None,
     ) -> None:
-        self.data, self.scales, self.limits = data, scales, limits
+        self.data, self.scales, self.limits, self.numbers = data, scales, limits, data.numbers
         if state is None:
-            inverse = data.factorised(scales).inverse
-            state = inverse, inverse @ data.target.flatten()
+            process = data.process(scales)
+            state = process.inverse, process.mu
         self.inverse, self.mu = state
-        jacobian = data.jacobian
-        self.pairs = contracted(self.inverse, jacobian, jacobian).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
-        self.rows = torch.einsum("imn,im->ni", jacobian, self.mu.view_as(data.target))  # (n, N) J_l^T K^-1 r
+        numbers = self.numbers
+        self.q = numbers.q - numbers.q.mean(0)
+        self.pairs = joint_weights(numbers, numbers, self.inverse).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
+        rows = [(part.J.mT @ self.mu[part.numbers].view(*part.cells.shape, 1))[..., 0] for part in numbers.parts]
+        self.rows = torch.cat(rows).T  # (n, N) J_l^T K^-1 r
         first, last = (round(w / limits.step) for w in (limits.lowest, limits.highest))
         self._steps = slice(first, last + 1)
         self.frequencies = limits.step * torch.arange(first, last + 1, dtype=data.x.dtype, device=data.x.device)
@@ -142,8 +144,7 @@ class _Scan:
 
     def _binned(self, joint: int) -> tuple[Tensor, Tensor, Tensor]:
         """s, A_cc + A_ss and A_cc - A_ss + 2 i A_cs at all frequencies (F,)."""
-        q, P = self.data.x[:, joint], self.pairs[joint]
-        q = q - q.mean()
+        q, P = self.q[:, joint], self.pairs[joint]
         both, unlike = self._transform(q[:, None] - q, P).real, self._transform(q[:, None] + q, P)
         return self._transform(q, self.rows[joint]), both, unlike
 
@@ -162,7 +163,7 @@ class _Scan:
 
     def _exact(self, joint: int, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """s, A_cc + A_ss and A_cc - A_ss + 2 i A_cs without bins, at a few frequencies (F,)."""
-        angles = frequencies * (self.data.x[:, joint] - self.data.x[:, joint].mean())[:, None]
+        angles = frequencies * self.q[:, joint, None]
         waves = torch.complex(angles.cos(), angles.sin())  # (N, F)
         turned = self.pairs[joint].to(waves.dtype) @ waves
         return (
@@ -202,13 +203,12 @@ class _Scan:
         _, A = self._normal_equations(joint, frequency)
         weights = torch.linalg.solve(A, U.T)
         inverse = self.inverse - U @ weights
-        return _Scan(self.data, self.scales, self.limits, (inverse, inverse @ self.data.target.flatten()))
+        return _Scan(self.data, self.scales, self.limits, (inverse, inverse @ self.numbers.target))
 
     def _columns(self, joint: int, frequency: float) -> Tensor:
         """X (N m, 2)."""
-        angle = frequency * (self.data.x[:, joint] - self.data.x[:, joint].mean())
-        waves = torch.stack([angle.cos(), angle.sin()], -1)
-        return (self.data.jacobian[:, :, joint, None] * waves[:, None]).flatten(0, 1)
+        angle = frequency * self.q[:, joint]
+        return self.numbers.J[:, joint, None] * torch.stack([angle.cos(), angle.sin()], -1)[self.numbers.row]
 
     def _normal_equations(self, joint: int, frequency: float) -> tuple[Tensor, Tensor]:
         X = self._columns(joint, frequency)
@@ -216,7 +216,7 @@ class _Scan:
 
     def width(self, joint: int) -> float:
         """Distance from a peak within which its side lobes lie, which predict the same in the joint's range."""
-        q = self.data.x[:, joint]
+        q = self.q[:, joint]
         return 4.0 * pi / max(float(q.max() - q.min()), 1e-9)
 
     def threshold(self, joints: list[int]) -> float:
@@ -231,7 +231,7 @@ class _Scan:
 
     def _spread(self, joint: int) -> float:
         """Standard deviation of the joint's values, weighted by what the rows tell of it, rad."""
-        q, weights = self.data.x[:, joint], self.pairs[joint].diagonal()
+        q, weights = self.q[:, joint], self.pairs[joint].diagonal()
         mean = (weights * q).sum() / weights.sum()
         return float((weights * (q - mean).square()).sum() / weights.sum()) ** 0.5
 

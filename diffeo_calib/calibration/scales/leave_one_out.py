@@ -1,6 +1,6 @@
-"""Errors of the tangent model that decide about outliers: weights by heavy tails, and leave-one-out errors.
+"""Errors of the tangent model that decide about outliers: weights of gross errors, and leave-one-out errors.
 
-The weights of Student's t (student_t.py) need the errors of the measurements, not the residuals of the fit, which are
+The weights (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are
 smaller. The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
@@ -12,18 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf, nan
+from math import nan
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
-from diffeo_calib.calibration.student_t import Tails, region_factor, reweight, weighed
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.quantiles import known
-from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import factorise
+from diffeo_calib.process.process import Factor
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression.conditional import NOISE_ADVICE
+from diffeo_calib.regression.regions import region_factor
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
@@ -79,7 +81,7 @@ def estimate_tails(
     rounds: int = ROUNDS,
     block_coordinates: int = BLOCK_COORDINATES,
 ) -> Tails:
-    """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
+    """Weights and gross errors for given scales, by expectation maximisation from the weights of the data.
 
     Args:
         data: the measurements. scales: held fixed. seed: draws the blocks.
@@ -102,7 +104,7 @@ def estimate_tails(
 def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
     """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
 
-    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
+    Share and size of gross errors are those with the weights of the data. With these each block finds its own
     weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
     """
     data = data.told
@@ -111,11 +113,11 @@ def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> 
     for rows in blocks:
         squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
     first = reweight(squares, data.noise_model.freedom)
-    for rows in blocks if first.freedom < inf else ():
+    for rows in blocks if first.share > 0.0 else ():
         block, tails = _Block(data.rows(rows), scales), first.rows(rows)
         for _ in range(ROUNDS - 1):
             squares[rows] = block.squares(tails)
-            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
+            before, tails = tails, first.weighed(squares[rows], data.noise_model.freedom)
             if _settled(before, tails):
                 break
     return reweight(squares, data.noise_model.freedom)
@@ -161,26 +163,29 @@ class _Block:
     """Everything about one block that does not depend on the weights."""
 
     def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
-        self.noise_model, self.target, self.shared = data.noise_model, data.target, data.shared
-        self.noise, self.linearisation = data.noise(scales), data.linearisation(scales)
-        self.gram = data.gram(scales)
+        self.noise_model, self.numbers = data.noise_model, data.numbers
+        self.noise, self.expected = data.noise(scales), data.expected(scales)
 
     def squares(self, tails: Tails) -> Tensor:
         """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
-        noise = self.noise_model.weighted(self.noise, tails)
-        dense = factorise(self.linearisation, Noise(noise, self.shared), self.gram)
-        inverse = dense.inverse_blocks(len(noise))
-        residual = noise @ dense.mu(self.target)[:, :, None]
-        moments = residual @ residual.mT + noise - noise @ inverse @ noise
+        numbers, weighted = self.numbers, self.noise_model.weighted(self.noise, tails)
+        noise = numbers.blocks_of_table(weighted)
+        factor = Factor.of(numbers.add_blocks(self.expected.fields.clone(), noise), self.expected.features)
+        if factor is None:
+            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+        mu = numbers.in_table(factor.solve(numbers.target[:, None])[:, 0])
+        inverse = numbers.blocks_in_table(numbers.diagonal_blocks(factor.inverse))
+        residual = weighted @ mu[:, :, None]
+        moments = residual @ residual.mT + weighted - weighted @ inverse @ weighted
         return self.noise_model.squares(self.noise, moments)
 
 
 def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:
     """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
-    dense, noise = data.factorised(scales), data.weighted_noise(scales)
-    mu, inverse = dense.mu(data.target), dense.inverse_blocks(len(noise))
-    covariance = torch.linalg.inv(inverse)  # of the prediction, with the row's own weighted noise
-    error = covariance @ mu[:, :, None]
-    predicted = covariance - noise + data.noise(scales)
-    effective = mu.numel() - float((noise * inverse).sum())
-    return error[:, :, 0], data.noise_model.squares(predicted, error @ error.mT), effective
+    numbers, process, noise = data.numbers, data.process(scales), data.weighted_noise(scales)
+    blocks, own = numbers.diagonal_blocks(process.inverse), numbers.blocks_of_table(noise)
+    covariance = numbers.blocks_in_table([torch.linalg.inv(block) for block in blocks])  # with the row's own noise
+    error = covariance @ numbers.in_table(process.mu)[:, :, None]
+    effective = len(process.mu) - float(sum((one * block).sum() for one, block in zip(own, blocks, strict=True)))
+    squares = data.noise_model.squares(covariance - noise + data.noise(scales), error @ error.mT)
+    return error[:, :, 0], squares, effective

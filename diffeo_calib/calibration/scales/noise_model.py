@@ -28,8 +28,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
@@ -38,6 +36,8 @@ from diffeo_calib.measurements.pose_frames import block_diagonal, inverse_poses,
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import Tails
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""

@@ -12,14 +12,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import (
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.process.scales import (
     DEVIATIONS,
     SCALES,
     GearLine,
     Hyperparameters,
 )
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.tree import Tree
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import log, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +17,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.scales.hyperparameters import SENSOR_SHARE, Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import PresentNumbers, TangentData
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.regression.cholesky import seen_numbers
+from diffeo_calib.process.process import Factor
+from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
 
 MESHING_LENGTHSCALE_RAD = 0.22
 """Default length scale of the transmission kernels on a circle: meshing of a reduction gear."""
@@ -161,34 +159,26 @@ def log_posterior(
     Returns:
         None where G + R, or the noise by itself, is not positive definite in float64.
     """
-    data, point = data.told, logarithms.detach().clone().requires_grad_()
+    told, numbers, point = data.told, data.numbers, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
-        terms = data.covariance_terms(centre.from_logarithms(point), data.present)
-    try:
-        matrix = terms.matrix()
-    except InputError:  # the noise blocks are not positive definite
+        scales = centre.from_logarithms(point)
+        noise = numbers.blocks_of_table(told.weighted_noise(scales))
+        variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
+    root = variance.detach().sqrt()
+    F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
+    factor = Factor.of(F, numbers.S * root)
+    if factor is None:
         return None
-    likelihood, slope = _of_measured(matrix, data.present)
-    if slope is None:
-        return None
+    mu = factor.solve(numbers.target[:, None])[:, 0]
+    slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
     with torch.enable_grad():
+        by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
+        by_unknowns = factor.by_variance(root * (numbers.S.T @ mu)) @ variance.log()
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-        (terms.inner(slope) + density).backward()
+        (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
+    likelihood = factor.log_density(numbers.target, mu)
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(likelihood, float(density.detach()), gradient)
-
-
-def _of_measured(matrix: Tensor, rows: PresentNumbers) -> tuple[float, Tensor | None]:
-    """Log likelihood of what was measured under G + R, and its derivative by all of G + R (N R', N R')."""
-    seen, target = seen_numbers(rows.visible), rows.target.flatten()
-    if seen is None:
-        return log_likelihood(matrix, target)
-    likelihood, slope = log_likelihood(matrix[seen[:, None], seen], target[seen])
-    if slope is None:
-        return likelihood, None
-    whole = torch.zeros_like(matrix)
-    whole[seen[:, None], seen] = slope
-    return likelihood, whole
 
 
 def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:
@@ -236,20 +226,6 @@ class _Search:
             self.best, self.best_value = self.centre.from_logarithms(point), value
             self.best_likelihood = found.likelihood
         return -value, -found.gradient.numpy()
-
-
-def log_likelihood(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None]:
-    """log N(target; 0, matrix), and its derivative by the matrix, 1/2 (mu mu^T - matrix^-1).
-
-    The derivative is in closed form: automatic differentiation of the factorisation costs several times more. It is
-    None for a matrix that is not positive definite in float64.
-    """
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    if int(info):
-        return -float("inf"), None
-    mu = torch.cholesky_solve(target[:, None], factor)[:, 0]
-    value = -0.5 * float(target @ mu) - float(factor.diagonal().log().sum()) - 0.5 * len(target) * log(2 * pi)
-    return value, torch.cholesky_inverse(factor).addr_(mu, mu, beta=-0.5, alpha=0.5)
 
 
 LARGEST_AMPLITUDE_RATIO = 3.0

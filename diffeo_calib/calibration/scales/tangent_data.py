@@ -16,19 +16,18 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters, SeparateKernels, SumOfKernels
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
-from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
-from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
-from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.process.covariance import Covariance
+from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.process import Expected, Process
+from diffeo_calib.process.scales import GearLine, Hyperparameters
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.placement import PLACES
 
@@ -224,7 +223,7 @@ class TangentData:
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)
-        vars(other)["_last_gram"] = vars(self).get("_last_gram")
+        vars(other).update({name: vars(self)[name] for name in ("numbers", "_expected") if name in vars(self)})
         told = vars(self).get("told")
         if told is not None and told is not self:
             vars(other).update(basis=self.basis, told=told.with_tails(tails))
@@ -283,18 +282,43 @@ class TangentData:
         """R_i with the weights of the tails: (N, m, m), m^2."""
         return self.noise_model.weighted(self.noise(scales), self.tails)
 
-    def gram(self, scales: Hyperparameters) -> Tensor:
-        """G: (N m, N m), m^2."""
-        return self._kept("_last_gram", scales, lambda: self.linearisation(scales).gram())
+    @cached_property
+    def numbers(self) -> Numbers:
+        """All that the rows tell; the shifts that they share are the last unknowns."""
+        told = self.told
+        S = told.sensitivities if told.shared is None else torch.cat([told.sensitivities, told.shared], 2)
+        slopes = told.slopes
+        if slopes is None:
+            R = told.y.shape[1]
+            slopes = torch.eye(R, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), R, R)
+        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=slopes)
 
-    def factorised(self, scales: Hyperparameters) -> CholeskyRegression:
-        """G + R with weighted noise, factorised."""
+    @cached_property
+    def pairs(self) -> Covariance:
+        """The covariance of the numbers by the fields, for many scales."""
+        return Covariance(self.numbers, self.numbers, self.space)
 
-        def factor() -> CholeskyRegression:
-            blocks, at, gram = self.weighted_noise(scales), self.linearisation(scales), self.gram(scales)
-            return factorise(at, Noise(blocks, self.shared), gram)
+    def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
+        """(K,) prior variances of theta and of the shifts."""
+        shifts = self.x.new_ones(0 if self.shared is None else self.shared.shape[2])
+        return torch.cat([self.prior_variance(scales), shifts])
 
-        return self._kept("_last_factor", scales, factor)
+    def prior(self, scales: Hyperparameters) -> Process:
+        """What is known before these rows."""
+        return Process.prior(scales, self.space, self.unknowns_variance(scales), self.numbers)
+
+    def expected(self, scales: Hyperparameters) -> Expected:
+        """The numbers as they are expected before the rows."""
+        return self._kept("_expected", scales, lambda: self.prior(scales).expected(self.numbers))
+
+    def process(self, scales: Hyperparameters) -> Process:
+        """What is known by these rows with their weights."""
+
+        def given() -> Process:
+            noise = self.numbers.blocks_of_table(self.told.weighted_noise(scales))
+            return self.prior(scales).given(self.numbers, noise, self.expected(scales))
+
+        return self._kept("_process", scales, given)
 
     def _kept(self, name: str, scales: Hyperparameters, compute: Callable[[], T]) -> T:
         """The last value for these very scales; computed if there is none."""
@@ -306,146 +330,3 @@ class TangentData:
         if self.y.numel() <= KEPT_COORDINATES:
             vars(self)[name] = scales, value
         return value
-
-    def covariance_terms(self, scales: Hyperparameters, rows: PresentNumbers | None = None) -> CovarianceTerms:
-        """The terms of G + R with weighted noise, differentiable in the scales.
-
-        Args:
-            scales: of the model. rows: :attr:`present` for these numbers alone; by default all R of every row.
-        """
-        joint, task = self._squared_distances
-        values = scales.joint_kernel_values(joint), scales.task_kernel_values(task)
-        rows = PresentNumbers.all_of(self) if rows is None else rows
-        return CovarianceTerms(rows, *values, self.prior_variance(scales), rows.blocks(self.weighted_noise(scales)))
-
-    @cached_property
-    def present(self) -> PresentNumbers:
-        """The rows without numbers that were not measured, as far as all rows can do without as many."""
-        return PresentNumbers.of(self)
-
-    @cached_property
-    def _squared_distances(self) -> tuple[Tensor, Tensor]:
-        """Squared distances of all pairs of configurations (n, N, N) and of points (N P, N P) in m^2."""
-        points = self.points.reshape(-1, 3)
-        return self.space.squared_distances(self.x, self.x), (points[:, None] - points).square().sum(-1)
-
-
-@dataclass(frozen=True, eq=False)
-class PresentNumbers:
-    """Rows with the numbers that they report side by side, as many as the longest row has: R' of R.
-
-    Args:
-        index: (N, R') which of the R numbers they are; None if all rows report all numbers.
-        visible: (N, R') boolean: shorter rows are filled up with absent ones.
-        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K).
-        slopes: (N, R', 3 P), None for coordinates of all points. shared: (N, R', c) or None.
-    """
-
-    index: Tensor | None
-    visible: Tensor
-    target: Tensor
-    jacobian: Tensor
-    sensitivities: Tensor
-    slopes: Tensor | None
-    shared: Tensor | None
-
-    @classmethod
-    def of(cls, data: TangentData) -> PresentNumbers:
-        """Those of some rows."""
-        visible, own = data.visible, (data.target, data.jacobian, data.sensitivities)
-        width = int(visible.sum(1).max())
-        if width == visible.shape[1]:
-            return cls.all_of(data)
-        index = visible.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :width]
-        rows = torch.arange(len(index), device=index.device)[:, None]
-        slopes = data.slopes
-        if slopes is None:
-            count = visible.shape[1]
-            slopes = torch.eye(count, dtype=data.y.dtype, device=data.y.device).expand(len(index), count, count)
-        shared = None if data.shared is None else data.shared[rows, index]
-        seen, target, jacobian, sensitivities, slopes = (values[rows, index] for values in (visible, *own, slopes))
-        return cls(index, seen, target, jacobian, sensitivities, slopes, shared)
-
-    @classmethod
-    def all_of(cls, data: TangentData) -> PresentNumbers:
-        """All R numbers of every row, absent ones too."""
-        own = data.target, data.jacobian, data.sensitivities
-        return cls(None, data.visible, *own, data.slopes, data.shared)
-
-    def blocks(self, noise: Tensor) -> Tensor:
-        """Blocks (N, R, R) of the noise of these numbers: (N, R', R')."""
-        if self.index is None:
-            return noise
-        rows = torch.arange(len(noise), device=noise.device)[:, None, None]
-        return noise[rows, self.index[:, :, None], self.index[:, None]]
-
-
-@dataclass(frozen=True, eq=False)
-class CovarianceTerms:
-    """What G + R = Dk0 K_V Dk0^T + K_W + S Lambda^-1 S^T + R is made of, for a search that needs it for many scales.
-
-    The same matrix as that of :meth:`TangentData.linearisation` with its noise, at a small part of its cost: distances
-    are computed once, and all joints at a time.
-
-    Args:
-        rows: the measurements.
-        joint: values (n, N, N), diagonals of K_V. task: values (1, N P, N P), kappa of K_W = kappa I, m^2.
-        prior_variance: (K,) of theta. noise: (N, R', R') blocks R_i, m^2.
-    """
-
-    rows: PresentNumbers
-    joint: SumOfKernels
-    task: SeparateKernels
-    prior_variance: Tensor
-    noise: Tensor
-
-    def matrix(self) -> Tensor:
-        """G + R: (N m, N m), m^2, without a graph.
-
-        Raises:
-            InputError: noise that is not positive definite.
-        """
-        jacobian, S = self.rows.jacobian, self.rows.sensitivities.flatten(0, 1)
-        total = diagonal_gram(self.joint.values.transpose(0, 1).contiguous(), jacobian, jacobian)
-        total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
-        task, slopes = self.task.values[0], self.rows.slopes
-        if slopes is None:
-            total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
-        else:
-            total += observed_task_gram(task, slopes)
-        return Noise(self.noise.detach(), self.rows.shared).add_to(total)
-
-    def inner(self, weights: Tensor) -> Tensor:
-        """sum(weights * (G + R)) for weights (N m, N m), differentiable in the scales: scalar.
-
-        With the gradient of a function of G + R as weights, its derivative is that of the function, but autograd
-        records no matrix of this size.
-        """
-        jacobian, S = self.rows.jacobian, self.rows.sensitivities.flatten(0, 1)
-        by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1).contiguous()
-        count = self.task.values.shape[1]
-        if self.rows.slopes is None:
-            by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
-        else:
-            by_point = task_weights(weights, self.rows.slopes)
-        total = self.joint.inner(by_joint) + self.task.inner(by_point[None])
-        total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
-        return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()
-
-
-def observed_task_gram(task: Tensor, slopes: Tensor) -> Tensor:
-    """A kappa A^T: kappa (N P, N P) of points on R^3, slopes A (N, r, 3 P) -> (N r, N r)."""
-    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))  # (N, r, P, 3)
-    P = each.shape[2]
-    right = each.permute(0, 2, 3, 1).reshape(N, P, 3 * r)
-    half = task.view(N * P, N, P).transpose(0, 1) @ right  # (N, N P, 3 r), the first N of the right
-    half = half.view(N, N, P, 3, r).permute(1, 2, 3, 0, 4).reshape(N, 3 * P, N * r)
-    return (slopes @ half).view(N * r, N * r)
-
-
-def task_weights(weights: Tensor, slopes: Tensor) -> Tensor:
-    """The weights of kappa (N P, N P) in a sum of weights (N r, N r) times :func:`observed_task_gram`."""
-    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))
-    P = each.shape[2]
-    half = (slopes.mT @ weights.view(N, r, N * r)).view(N, P, 3, N, r)
-    return torch.einsum("ipcjr,jrqc->ipjq", half, each).reshape(N * P, N * P)

@@ -8,8 +8,7 @@ keops        LazyTensors, compiled by KeOps (needs a compiler)      O(M + N)   f
 distributed  tiles shared by the processes of one torchrun program  O(M + N)   several processes
 auto         dense, fused, tiled or keops, by the number of pairs, the device and what is installed
 
-With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
-(single.py), whatever the backend.
+With an accuracy, large sums go by plane waves (fourier.py) where these take less time, whatever the backend.
 
 To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
@@ -24,7 +23,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
+from diffeo_calib.kernels.reductions import fourier, keops
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Dense, Formula, MatrixPairs, Points
 from diffeo_calib.kernels.reductions.fused.sums import FUSED
@@ -69,8 +68,6 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
-WITHIN_ACCURACY = (fourier.sums, nearby.sums, single.sums)
-"""Sums with an error: tried in this order, each used where it takes less time than all pairs."""
 FINEST_ACCURACY = 1e-12
 """Below it rounding counts."""
 FALLBACK = "tiled"
@@ -150,10 +147,9 @@ def evaluate(
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
     if accuracy is not None and name != "dense" and not followed and _finite(at, columns):
-        for method in WITHIN_ACCURACY:
-            found = method(formula, profile, *_centred(rows, columns), accuracy)
-            if found is not None:
-                return found
+        found = fourier.sums(formula, profile, *_centred(rows, columns), accuracy)
+        if found is not None:
+            return found
     try:
         found = BACKENDS[name].reduce(
             formula, profile, *(rows, columns) if name == "fused" else _centred(rows, columns)

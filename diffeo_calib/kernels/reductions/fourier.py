@@ -18,15 +18,16 @@ grids, Applied and Computational Harmonic Analysis 71 (2024).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import ceil, pi, prod
+from functools import lru_cache
+from math import ceil, gamma, pi, prod
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Field, FieldAndJacobian, Formula, Gradient, HessianProduct, Points
-from diffeo_calib.kernels.reductions.nearby import bandwidth, negligible_beyond
 
 MOST_WAVES = 1 << 16
 """Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""
@@ -38,6 +39,45 @@ WAVES_TIMES_POINTS_AT_ONCE = 1 << 20
 """Waves times points in memory at once."""
 CHECKED_ROWS = 24
 """Rows and columns at which every lattice is checked."""
+DERIVATIVES = 2
+"""The highest derivative of the kernel in a formula."""
+STEPS, FARTHEST = 4096, 60.0
+"""Distances and frequencies that are looked at."""
+
+
+@lru_cache(maxsize=256)
+def negligible_beyond(profile: Profile, dim: int, accuracy: float) -> float | None:
+    """The distance beyond which the kernel of ``dim`` features and its derivatives are below an accuracy, if any.
+
+    A factor of 3^dim is left for the copies of a kernel on a lattice.
+    """
+    r = _grid()
+    kappa = profile.derivatives(r.square(), DERIVATIVES)
+    second = 2 * kappa[1].abs() + 4 * r.square() * kappa[2].abs()
+    size = torch.stack([kappa[0].abs(), 2 * r * kappa[1].abs(), second]).amax(0)
+    return _first_below(3.0**dim * size.flip(0).cummax(0).values.flip(0), accuracy)
+
+
+@lru_cache(maxsize=256)
+def bandwidth(profile: Profile, dim: int, accuracy: float) -> float | None:
+    """The frequency beyond which the spectral density, with its first two moments, adds up to less than an accuracy."""
+    w = _grid()
+    density = profile.spectral_density(w.square(), dim)
+    if density is None:
+        return None
+    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * w ** (dim - 1) * (FARTHEST / STEPS)
+    beyond = torch.stack([shell * w**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1)
+    return _first_below(beyond.amax(0), accuracy)
+
+
+def _grid() -> Tensor:
+    return torch.linspace(0.0, FARTHEST, STEPS + 1, dtype=torch.float64, device=HOST)[1:]
+
+
+def _first_below(values: Tensor, level: float) -> float | None:
+    """Where on the grid decreasing values fall below a level."""
+    below = values < level
+    return float(_grid()[below][0]) if bool(below[-1]) else None
 
 
 def sums(

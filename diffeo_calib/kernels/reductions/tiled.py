@@ -59,11 +59,9 @@ class Tiled:
 
     Args:
         elements: pairs in a tile; by default a number that suits the device.
-        totals: precision in which tiles are added up; by default that of the points.
     """
 
     elements: int | None = None
-    totals: torch.dtype | None = None
     differentiable: ClassVar[bool] = True
 
     def usable(self) -> bool:
@@ -102,7 +100,7 @@ class Tiled:
         """
         at = columns if rows is None else rows
         elements, parts = self._elements(at.features.device), PARTS if _large(at, columns) else 1
-        what = _Sum(formula, profile, elements, self.totals)
+        what = _Sum(formula, profile, elements)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         if rows is None:
             side, chosen = max(1, int(elements**0.5)), mine or list
@@ -134,17 +132,15 @@ class _Sum:
 
     Args:
         elements: size of the buffers that intermediate matrices recycle; None where autograd needs all of them.
-        totals: precision of the sum over tiles, if not that of the points.
     """
 
     formula: Formula
     profile: Profile
     elements: int | None = None
-    totals: torch.dtype | None = None
 
     def zeros(self, like: Tensor, *shape: int) -> Tensor:
         """Where tiles are added up."""
-        return torch.zeros(shape, dtype=self.totals or like.dtype, device=like.device)
+        return torch.zeros(shape, dtype=like.dtype, device=like.device)
 
     def weights(self, rows: Points, columns: Points) -> list[Any]:
         """The weights w_ij of one tile, matrices with a scale; a pooled one holds its buffer while it is referenced."""
@@ -174,9 +170,7 @@ def _symmetric(
     tiles = _slices(len(points.features), size)
     chosen = own(range(len(tiles)))
     if len(tiles) == 1 and chosen:
-        return [
-            t.T if what.totals is None else t.T.to(what.totals) for t in _sums(what.weights(points, points), summands)
-        ]
+        return [t.T for t in _sums(what.weights(points, points), summands)]
 
     def part(tile_rows: list[int]) -> list[Tensor]:
         """Some rows of tiles, from the diagonal on, and their mirror images: (k, N) each."""
@@ -215,7 +209,6 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
         total: list[Tensor] | None = None
         for j in widths:
             part = _sums(what.weights(rows.rows(i), columns.rows(j)), [b[:, j] for b in summands])
-            part = part if what.totals is None else [p.to(what.totals) for p in part]
             total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
         parts.append(total)
     return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]

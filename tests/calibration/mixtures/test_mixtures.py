@@ -19,11 +19,11 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
@@ -127,7 +127,7 @@ def test_the_posterior_of_independent_equations(tangent: TangentData) -> None:
     R = R + torch.diag(levels[own].square() + 1e-14)
     G, Z = data.linearisation(scales).gram()[seen][:, seen], shared.flatten(0, 1)[seen]
     mu = torch.linalg.solve(G + R + Z @ Z.mT, data.target.flatten()[seen])
-    found = data.factorised(scales).mu(data.target).flatten()[seen]
+    found = data.numbers.in_table(data.process(scales).mu).flatten()[seen]
     assert float((found - mu).norm() / mu.norm()) < 1e-6
 
 

@@ -292,23 +292,14 @@ class Fused:
             return None
 
     def reduce(
-        self,
-        formula: Formula,
-        profile: Profile,
-        rows: Points | None,
-        columns: Points,
-        dtype: torch.dtype | None = None,
+        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
     ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, or None where it is not for this backend; not differentiable by autograd.
-
-        Args:
-            dtype: of the results, by default that of the points. Sums of single points are added up in double.
-        """
+        """The results of a formula, or None where it is not for this backend; not differentiable by autograd."""
         compiled = self.program(formula, profile, rows, columns)
         if compiled is None:
             return None
         at = columns if rows is None else rows
-        return compiled.results(compiled.totals(rows, columns), len(at.features), dtype or at.features.dtype)
+        return compiled.results(compiled.totals(rows, columns), len(at.features), at.features.dtype)
 
 
 FUSED = Fused()

@@ -193,13 +193,6 @@ class Hyperparameters:
         task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
         return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
 
-    def geometry_only(self) -> Hyperparameters:
-        """Geometry and white noise only, with noise of the size of the expected geometric residual."""
-        zero = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES)}
-        levels = [name for name in ("sensor_noise", "rotation_noise", OTHER_NOISE) if getattr(self, name) is not None]
-        noise = {name: getattr(self, name) / SENSOR_SHARE for name in levels}
-        return replace(self, **zero, **noise, lines=())
-
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
         lines = tuple(replace(line, amplitude=factor * line.amplitude) for line in self.lines)

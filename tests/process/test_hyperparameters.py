@@ -10,8 +10,8 @@ from tangent_bank import Setting, shaken
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.process.scales import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 
 
 def test_logarithms_round_trip(setting: Setting) -> None:
@@ -95,17 +95,6 @@ def test_inflated_scales_scale_the_covariance(setting: Setting) -> None:
     assert_close(data.noise(inflated), 1.7**2 * data.noise(scales))
 
 
-def test_geometry_only_has_no_fields_and_the_noise_of_the_geometric_residual(setting: Setting) -> None:
-    data, scales = setting.tangent_data, setting.scales.geometry_only()
-    K = setting.nominal.geometry.size
-    S = data.sensitivities[..., :K].flatten(0, 1)
-    expected = S * scales.prior_variance(data.nominal)[:K] @ S.mT
-    gram = data.linearisation(scales).gram()
-    assert_close(gram, expected, rtol=0, atol=1e-12 * float(gram.abs().max()))
-    # the default noise of the sensor is a share of the residual of the geometric calibration
-    assert float(scales.sensor_noise) == pytest.approx(setting.identification.noise, rel=1e-12)
-
-
 def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
     """Their columns are J_l cos and J_l sin, their prior b^2; they are no scales of the search."""
     lines = (GearLine(0, 101.3, 5e-5), GearLine(setting.data.n - 1, 40.2, 2e-5))
@@ -114,7 +103,6 @@ def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
     assert torch.equal(scales.logarithms(), setting.scales.logarithms())
     assert scales.from_logarithms(scales.logarithms()).lines == lines
     assert scales.inflated(2.0).lines[1] == GearLine(setting.data.n - 1, 40.2, 4e-5)
-    assert scales.geometry_only().lines == ()
     expected = data.linearisation(setting.scales).gram()
     for line in lines:
         wave = line.frequency * (data.x[:, None, line.joint] - data.x[:, line.joint])

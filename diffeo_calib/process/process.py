@@ -1,0 +1,189 @@
+"""What is known of fields and unknowns from rows: one Gaussian, conditioned on more rows by one block of Cholesky.
+
+With F the covariance of the rows' numbers by the fields and R that of their noise, L L^T = F + R, W = L^-1 S P^1/2 of
+the unknowns with prior N(0, P), and B B^T = 1 + W^T W,
+
+    u^ = P^1/2 B^-T B^-1 W^T alpha,    alpha = L^-1 target,    mu = L^-T (alpha - W P^-1/2 u^) = K^-1 target,
+
+where K = F + R + S P S^T is never formed: priors of metres beside noise of micrometres cost no digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import log, pi
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.threads import large_work
+from diffeo_calib.kernels.spaces import Space
+from diffeo_calib.process.covariance import Covariance
+from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.conditional import NOISE_ADVICE
+
+
+class Factor:
+    """K = L L^T + H H^T of numbers with features H (M, K): L, W = L^-1 H and B.
+
+    Args:
+        L: (M, M) lower Cholesky factor. W: (M, K).
+    """
+
+    def __init__(self, L: Tensor, W: Tensor) -> None:
+        self.L, self.W = L, W
+        eye = torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
+        self.B = torch.linalg.cholesky(eye + W.T @ W)
+
+    @classmethod
+    def of(cls, F: Tensor, H: Tensor) -> Factor | None:
+        """Of F + H H^T; None where F is not positive definite in float64."""
+        with large_work(F.numel()):
+            L, info = torch.linalg.cholesky_ex(F)
+            return None if int(info) else cls(L, torch.linalg.solve_triangular(L, H, upper=False))
+
+    def solve(self, values: Tensor) -> Tensor:
+        """K^-1 values (M, k)."""
+        white = torch.linalg.solve_triangular(self.L, values, upper=False)
+        white = white - self.W @ torch.cholesky_solve(self.W.T @ white, self.B)
+        return torch.linalg.solve_triangular(self.L.T, white, upper=True)
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """K^-1 (M, M)."""
+        with large_work(self.L.numel()):
+            Y = torch.linalg.solve_triangular(self.B.T, self.W, upper=True, left=False)
+            Y = torch.linalg.solve_triangular(self.L.T, Y, upper=True)
+            return torch.cholesky_inverse(self.L).addmm_(Y, Y.T, alpha=-1.0)
+
+    def log_density(self, values: Tensor, solved: Tensor) -> float:
+        """log N(values; 0, K) for (M,) with K^-1 values."""
+        log_det = float(self.L.diagonal().log().sum() + self.B.diagonal().log().sum())
+        return -0.5 * float(values @ solved) - log_det - 0.5 * len(values) * log(2.0 * pi)
+
+    def by_variance(self, features_mu: Tensor) -> Tensor:
+        """Derivative of the log density by the logarithm of each feature's variance, with H^T K^-1 values: (K,)."""
+        return 0.5 * (features_mu.square() - 1.0 + torch.cholesky_inverse(self.B).diagonal())
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Numbers as the rows so far predict them, without noise: mean (M,), covariance F + D D^T.
+
+    Args:
+        mean: (M,). fields: F (M, M). features: D (M, K). white: (M', M) L^-1 F(rows so far, numbers).
+    """
+
+    mean: Tensor
+    fields: Tensor
+    features: Tensor
+    white: Tensor
+
+    @property
+    def covariance(self) -> Tensor:
+        """(M, M)."""
+        return self.fields + self.features @ self.features.T
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """The posterior of fields and unknowns by the rows given so far.
+
+    Args:
+        scales: of the fields. space: that of the joints. variance: (K,) prior P of the unknowns.
+        numbers: of the rows so far. factor: their covariance with noise. alpha: (M,) L^-1 target.
+    """
+
+    scales: Hyperparameters
+    space: Space
+    variance: Tensor
+    numbers: Numbers
+    factor: Factor
+    alpha: Tensor
+
+    @classmethod
+    def prior(cls, scales: Hyperparameters, space: Space, variance: Tensor, like: Numbers) -> Process:
+        """What is known before any row; ``like``: numbers of any rows, for their sizes."""
+        none = like.none
+        empty = Factor(variance.new_zeros(0, 0), variance.new_zeros(0, len(variance)))
+        return cls(scales, space, variance, none, empty, none.target)
+
+    def given(self, new: Numbers, noise: Sequence[Tensor], at: Expected | None = None) -> Process:
+        """Conditioned on more rows.
+
+        Args:
+            new: their numbers. noise: (N, r, r) of every part. at: :meth:`expected` of them, if known already.
+
+        Raises:
+            NumericalError: their covariance is not positive definite in float64.
+        """
+        at = self.expected(new) if at is None else at
+        F = new.add_blocks(at.fields.clone(), noise)
+        with large_work(F.numel()):
+            L, info = torch.linalg.cholesky_ex(F)
+        if int(info):
+            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+        before = torch.cat([self.alpha[:, None], self.factor.W], 1)
+        right = torch.cat([new.target[:, None], new.S * self.variance.sqrt()], 1) - at.white.T @ before
+        both = torch.cat([before, torch.linalg.solve_triangular(L, right, upper=False)])
+        if len(self.alpha):
+            top = torch.cat([self.factor.L, torch.zeros_like(at.white)], 1)
+            L, new = torch.cat([top, torch.cat([at.white.T, L], 1)]), self.numbers.joined(new)
+        return replace(self, numbers=new, factor=Factor(L, both[:, 1:]), alpha=both[:, 0])
+
+    def expected(self, new: Numbers) -> Expected:
+        """Numbers as the rows so far predict them."""
+        V = torch.linalg.solve_triangular(self.factor.L, self._covariance(self.numbers, new), upper=False)
+        D = new.S * self.variance.sqrt() - V.T @ self.factor.W
+        mean = V.T @ self.alpha + D @ self._shift
+        features = torch.linalg.solve_triangular(self.factor.B, D.T, upper=False).T
+        return Expected(mean, self._covariance(new, new) - V.T @ V, features, V)
+
+    def _covariance(self, a: Numbers, b: Numbers) -> Tensor:
+        """Prior covariance by the fields (Ma, Mb)."""
+        pairs = Covariance(a, b, self.space)
+        return pairs.matrix(pairs.values(self.scales))
+
+    @cached_property
+    def _shift(self) -> Tensor:
+        """(K,) P^-1/2 u^."""
+        return torch.cholesky_solve(self.factor.W.T @ self.alpha[:, None], self.factor.B)[:, 0]
+
+    @property
+    def estimate(self) -> Tensor:
+        """(K,) posterior mean of the unknowns."""
+        return self.variance.sqrt() * self._shift
+
+    @property
+    def covariance(self) -> Tensor:
+        """(K, K) posterior covariance of the unknowns."""
+        root = torch.linalg.solve_triangular(self.factor.B, torch.diag(self.variance.sqrt()), upper=False)
+        return root.T @ root
+
+    @cached_property
+    def mu(self) -> Tensor:
+        """(M,) K^-1 target."""
+        white = self.alpha - self.factor.W @ self._shift
+        return torch.linalg.solve_triangular(self.factor.L.T, white[:, None], upper=True)[:, 0]
+
+    @property
+    def inverse(self) -> Tensor:
+        """(M, M) K^-1."""
+        return self.factor.inverse
+
+    @property
+    def evidence(self) -> float:
+        """log N(target; 0, K) of all numbers; that of later ones given the others is a difference."""
+        return self.factor.log_density(self.numbers.target, self.mu)
+
+    def left_out(self, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """Errors of groups of numbers as all others predict them, and their covariances with noise: (g,), (g, g)."""
+        found = []
+        for group in groups:
+            covariance = torch.linalg.inv(self.inverse[group[:, None], group])
+            found.append((covariance @ self.mu[group], covariance))
+        return found

@@ -1,0 +1,87 @@
+"""The guard finds what is worse; two of its robots are as good as recorded."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import guard
+import guard_placing
+import pytest
+
+BASELINE = Path(guard.__file__).parent / "baselines" / "guard.json"
+ANY_PROCESSOR = guard.Tolerance(case=1.15, mean=1.05, share=0.05, time=float("inf"))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> guard.Cases:
+    return guard.cases(guard.read(BASELINE))
+
+
+@pytest.mark.parametrize(
+    "job", [pytest.param(job, marks=[pytest.mark.slow] * (job != guard.QUICK[0])) for job in guard.QUICK]
+)
+def test_a_robot_is_calibrated_as_well_as_recorded(job: Any, recorded: guard.Cases) -> None:
+    found = guard.cases(guard.measured(job))
+    assert {verb for verb, _ in found} >= {"calibrate", "evaluate", "predict", "registered", "recalibrate", "compare"}
+    rows, worse = guard.judged(found, recorded, ANY_PROCESSOR)
+    assert rows[-1]["errors"] > 5
+    assert not worse
+
+
+def test_the_baseline_is_not_worse_than_itself(recorded: guard.Cases) -> None:
+    rows, worse = guard.judged(recorded, recorded, guard.Tolerance())
+    assert not worse
+    assert rows[-1]["mean_ratio"] == pytest.approx(1.0)
+    notes = [note for own in recorded.values() for note in own.get("note", []) if note]
+    assert not notes
+
+
+CASE = ("calibrate", "positions")
+
+
+@pytest.mark.parametrize(
+    ("field", "factor", "sentence"),
+    [
+        ("error", 1.06, "calibrate, positions: error"),
+        ("true", 1.06, "calibrate, positions: true"),
+        ("new", 0.8, "calibrate, positions: new"),
+        ("inside", 0.8, "calibrate, positions: inside"),
+        ("true", None, "calibrate, positions: no true any more"),
+    ],
+)
+def test_a_worse_case_is_found(recorded: guard.Cases, field: str, factor: float | None, sentence: str) -> None:
+    found = copy.deepcopy(recorded)
+    found[CASE][field] = [factor and factor * value for value in found[CASE][field]]
+    _, worse = guard.judged(found, recorded, guard.Tolerance(mean=2.0))
+    assert len(worse) == 1
+    assert worse[0].startswith(sentence)
+
+
+def test_a_verb_that_is_slower_or_worse_on_the_whole_is_found(recorded: guard.Cases) -> None:
+    found = copy.deepcopy(recorded)
+    for (verb, _), own in found.items():
+        own["seconds"] = [1.2 * value if verb == "plan" else value for value in own["seconds"]]
+        own["true"] = [value and 1.01 * value for value in own.get("true", [None] * len(own["arm"]))]
+    found["compare", "positions"]["alarms"] = [1, 0, 0]
+    found["recalibrate", "positions"]["named"] = [0, 0, 0]
+    _, worse = guard.judged(found, recorded, guard.Tolerance())
+    assert [sentence.partition(": ")[0] for sentence in worse] == [
+        *("recalibrate", "compare", "plan"),
+        "the geometric mean of errors",
+    ]
+
+
+def test_what_is_better_passes_and_is_written(recorded: guard.Cases, tmp_path: Path) -> None:
+    better, path = copy.deepcopy(recorded), tmp_path / "better.json"
+    better[CASE]["error"] = [0.5 * value for value in better[CASE]["error"]]
+    guard.write(path, better)
+    assert guard.cases(guard.read(path)) == guard.cases(guard.read(path, path))
+    assert guard.run(guard.arguments(["--read", str(path), "--against", str(BASELINE)])) == 0
+    assert guard.run(guard.arguments(["--read", str(BASELINE), "--against", str(path)])) == 1
+
+
+@pytest.mark.parametrize("kind", ["positions", "poses", "heights"])
+def test_places_from_far_are_found(kind: str) -> None:
+    assert guard_placing.outcome(kind, 2)[0] == "right"

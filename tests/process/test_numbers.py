@@ -1,0 +1,103 @@
+"""Linearised rows as one list of numbers: which are there, where they stand in the table, and what they depend on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from process_bank import Case
+from tangent_bank import normal
+from torch import Tensor
+from torch.testing import assert_close
+
+from diffeo_calib.process.numbers import Numbers
+
+
+def table(shown: Tensor, seed: int = 0) -> Numbers:
+    """Rows of two points, whose coordinates are the numbers, with three joints and four unknowns."""
+    N, R = shown.shape
+    q, points, target = normal(N, 3, seed=seed), normal(N, R, seed=seed + 1), normal(N, R, seed=seed + 2)
+    S, J = normal(N, R, 4, seed=seed + 3), normal(N, R, 3, seed=seed + 4)
+    A = torch.eye(R, dtype=torch.float64).expand(N, R, R)
+    return Numbers.of(q, points, shown, target=target, S=S, J=J, A=A)
+
+
+PATTERNS = ("111111", "111000", "000111", "000000", "111111", "010001")
+SHOWN = torch.tensor([[number == "1" for number in pattern] for pattern in PATTERNS])
+
+
+def test_numbers_are_those_that_were_measured(case: Case) -> None:
+    told, numbers = case.data.told, case.numbers
+    R = told.y.shape[1]
+    assert numbers.shape == told.y.shape
+    assert sorted(numbers.cells.tolist()) == told.visible.flatten().nonzero()[:, 0].tolist()
+    row, column = numbers.cells // R, numbers.cells % R
+    assert torch.equal(numbers.owner, row)
+    assert torch.equal(numbers.target, told.target[row, column])
+    assert torch.equal(numbers.S, case.unknowns[numbers.cells])
+    assert torch.equal(numbers.J, told.jacobian[row, column])
+    assert torch.equal(numbers.q[numbers.row], told.x[row])
+
+
+def test_points_that_tell_nothing_are_not_there() -> None:
+    """Those of hidden markers; a row without any number is not there either."""
+    numbers = table(SHOWN)
+    points = normal(6, 6, seed=1).view(-1, 3)
+    expected = {tuple(point) for point in points[[0, 1, 2, 5, 8, 9, 10, 11]].tolist()}
+    assert {tuple(point) for point in numbers.z.tolist()} == expected
+    assert len(numbers.z) == len(expected)
+    assert len(numbers.q) == 5
+    assert len(numbers.target) == int(SHOWN.sum())
+
+
+def test_values_and_blocks_there_and_back() -> None:
+    numbers = table(SHOWN)
+    values, blocks = normal(6, 6, 2, seed=8), normal(6, 6, 6, seed=9)
+    back = numbers.in_table(numbers.of_table(values), torch.nan)
+    assert_close(back[SHOWN], values[SHOWN], rtol=0, atol=0)
+    assert bool(back[~SHOWN].isnan().all())
+    whole = numbers.blocks_in_table(numbers.blocks_of_table(blocks))
+    both = SHOWN[:, :, None] & SHOWN[:, None]
+    assert torch.equal(whole, torch.where(both, blocks, 0.0))
+    for own, again in zip(numbers.blocks_of_table(whole), numbers.blocks_of_table(blocks), strict=True):
+        assert torch.equal(own, again)
+
+
+def test_blocks_are_those_of_the_rows() -> None:
+    """In a matrix of all numbers, and added to it."""
+    numbers, matrix = table(SHOWN), normal(20, 20, seed=10)
+    expected = torch.where(numbers.owner[:, None] == numbers.owner, matrix, 0.0)
+    blocks = numbers.diagonal_blocks(matrix)
+    assert_close(numbers.add_blocks(torch.zeros_like(matrix), blocks), expected, rtol=0, atol=0)
+    assert_close(numbers.add_blocks(matrix.clone(), blocks), matrix + expected, rtol=0, atol=0)
+    for part, own in zip(numbers.parts, blocks, strict=True):
+        for cells, block in zip(part.cells, own, strict=True):
+            at = torch.cat([(numbers.cells == cell).nonzero()[0] for cell in cells])
+            assert torch.equal(block, matrix[at][:, at])
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_joined_numbers_are_those_of_the_joined_table(cut: int) -> None:
+    N, whole = len(SHOWN), {}
+    q, points, target = normal(N, 3, seed=0), normal(N, 6, seed=1), normal(N, 6, seed=2)
+    S, J, A = normal(N, 6, 4, seed=3), normal(N, 6, 3, seed=4), normal(N, 6, 6, seed=5)
+
+    def of(rows: slice) -> Numbers:
+        arrays = {"target": target[rows], "S": S[rows], "J": J[rows], "A": A[rows]}
+        return Numbers.of(q[rows], points[rows], SHOWN[rows], **arrays)
+
+    together, apart = of(slice(0, N)), of(slice(0, cut)).joined(of(slice(cut, N)))
+    assert apart.shape == together.shape
+    for numbers in (together, apart):
+        order = numbers.cells.argsort()
+        found = [numbers.cells, numbers.target, numbers.S, numbers.J, numbers.owner, numbers.q[numbers.row]]
+        whole[numbers] = [values[order] for values in found]
+    for first, second in zip(whole[together], whole[apart], strict=True):
+        assert torch.equal(first, second)
+    blocks = normal(N, 6, 6, seed=11)
+    found = apart.blocks_in_table(apart.blocks_of_table(blocks))
+    assert torch.equal(found, together.blocks_in_table(together.blocks_of_table(blocks)))
+
+
+def test_none_of_them() -> None:
+    none = table(SHOWN).none
+    assert (len(none.target), none.S.shape[1], none.J.shape[1], none.shape) == (0, 4, 3, (0, 6))

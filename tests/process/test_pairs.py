@@ -1,0 +1,87 @@
+"""Covariance of numbers by the fields: that of the linearised model, and derivatives by the scales."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from process_bank import Case
+from tangent_bank import normal
+from torch import Tensor
+from torch.testing import assert_close
+
+from diffeo_calib.process.covariance import Covariance, joint_weights
+from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.scales import Hyperparameters
+
+
+def two(case: Case) -> tuple[Numbers, Numbers]:
+    """Some rows, and the others with one of these."""
+    count = len(case.data.x)
+    return tuple(case.data.rows(rows).numbers for rows in (torch.arange(0, count, 3), torch.arange(1, count)))  # pyright: ignore
+
+
+def matrix(pairs: Covariance, scales: Hyperparameters) -> Tensor:
+    return pairs.matrix(pairs.values(scales))
+
+
+def test_matrix_is_that_of_the_linearised_model(case: Case) -> None:
+    found = matrix(case.data.pairs, case.scales)
+    at = case.numbers.cells
+    expected = case.fields[at][:, at]
+    assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+    assert_close(found, found.T, rtol=0, atol=1e-14 * float(expected.abs().max()))
+
+
+def test_both_fields_count(case: Case) -> None:
+    """Each by itself, where the other would hide it."""
+    at = case.numbers.cells
+    for name in ("transmission_amplitude", "coupled_amplitude", "task_amplitude"):
+        names = {"transmission_amplitude", "coupled_amplitude", "task_amplitude"} - {name}
+        alone = replace(case.scales, **{other: torch.zeros_like(getattr(case.scales, other)) for other in names})
+        expected = Case(case.data, alone).fields[at][:, at]
+        assert float(expected.abs().max()) > 0.0
+        assert_close(matrix(case.data.pairs, alone), expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+
+
+def test_some_rows_with_others(case: Case) -> None:
+    a, b = two(case)
+    count, R = len(case.data.x), case.data.told.y.shape[1]
+    rows, columns = torch.arange(0, count, 3)[a.owner], torch.arange(1, count)[b.owner]
+    at, to = rows * R + a.cells % R, columns * R + b.cells % R
+    expected = case.fields[at][:, to]
+    found = matrix(Covariance(a, b, case.data.space), case.scales)
+    assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+
+
+def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> None:
+    """Of each kind of scale, by central differences."""
+    a, b = two(case)
+    pairs, weights = Covariance(a, b, case.data.space), normal(len(a.target), len(b.target), seed=4)
+    point = case.scales.logarithms().requires_grad_()
+    inner = pairs.inner(pairs.values(case.scales.from_logarithms(point)), weights)
+    size = float((weights * matrix(pairs, case.scales)).abs().sum())
+    assert float(inner.detach()) == pytest.approx(float((weights * matrix(pairs, case.scales)).sum()), abs=1e-12 * size)
+    (gradient,) = torch.autograd.grad(inner, point)
+    where = point.detach()
+    for number, of_scale in enumerate(gradient):
+        step = torch.zeros_like(where)
+        step[number] = 1e-3
+
+        def at(times: float, step: Tensor = step) -> float:
+            return float((weights * matrix(pairs, case.scales.from_logarithms(where + times * step))).sum())
+
+        expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / 12e-3
+        assert float(of_scale) == pytest.approx(expected, rel=1e-6, abs=1e-9 * size)
+
+
+def test_weights_of_the_joints(case: Case) -> None:
+    """J^T W J of every pair of rows and every joint."""
+    a, b = two(case)
+    weights = normal(len(a.target), len(b.target), seed=5)
+    found = joint_weights(a, b, weights)
+    expected = torch.zeros_like(found)
+    for i in range(len(a.target)):
+        expected[a.row[i]].index_add_(1, b.row, (a.J[i][:, None] * weights[i] * b.J.T))
+    assert_close(found, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))
