@@ -25,14 +25,13 @@ from diffeo_calib.calibration.diagnostics.moved_devices import change_during
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
-    check_not_nominal,
+    warn_of_no_errors,
 )
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.stuck_columns import (
-    naming_stuck,
-    refuse_stuck,
     stuck_columns,
     warn_of_outliers,
+    warn_of_stuck,
 )
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
@@ -138,8 +137,8 @@ def calibrate(
         a :class:`CalibrationResult`; ``result.model`` is the calibrated kinematics.
 
     Raises:
-        MeasurementError: joints that do not match the robot, too few rows, a marker that no row shows, units that
-            cannot be right, or measurements that do not belong to these configurations.
+        MeasurementError: joints that do not match the robot, too few rows, a marker that no row shows, points that
+            never move, or rows that another reading of the table explains far better; the message names it.
         InputError: models of another type of robot, or scales given twice.
         RobotError: joint names in another order than the robot's.
 
@@ -148,7 +147,8 @@ def calibrate(
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
             lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
             tell more; joint offsets are far from the robot's description; the median residual of a geometric
-            calibration exceeds 2 % of the markers' spread; the rows show no errors of the robot; too few poses to
+            calibration exceeds 2 % of the markers' spread and no other reading explains it; a column holds one value
+            although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
             drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
             rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
@@ -163,11 +163,11 @@ def calibrate(
     check_controls(controls, measurements)
     check_joints(robot, measurements)
     with kept_warnings() as warned:
-        with naming_stuck(stuck_columns(measurements)):
-            placed = place(robot, measurements, progress)
+        placed = place(robot, measurements, progress)
         check_limits(robot, measurements)
         data = placed.tangent_data()
-        check_not_nominal(robot, data, placed.registration, placed.identification)
+        warn_of_no_errors(robot, data, placed.registration, placed.identification)
+        warn_of_stuck(data, stuck_columns(measurements))
         _warn_of_what_is_open(robot, placed, data)
         stages = placed.registration, placed.identification
         choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
@@ -253,9 +253,8 @@ def _result(
         devices.warn_of_weakness(model)
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
-    wrong, stuck = list({one.row for one in found}), stuck_columns(placed.data)
-    refuse_stuck(chosen.data, stuck, wrong)
-    warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck)
+    wrong = list({one.row for one in found})
+    warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck_columns(placed.data))
     changed = placed.mislabelled(model, found) or _change(placed, chosen)
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)

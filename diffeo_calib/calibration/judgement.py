@@ -17,11 +17,12 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence, w
 from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
+    LARGEST_ERROR_PER_REACH,
     causes_of,
-    check_possible,
     expected_covariance,
     expected_error,
     impossible,
+    impossible_errors,
     positions_of,
     some_rows,
 )
@@ -159,7 +160,7 @@ def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] |
 
 LARGE_PER_REACH, LARGE_PER_USUAL = 0.01, 20.0
 """Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
-are no errors of a calibrated robot."""
+are no errors of a calibrated robot; nor are those above a tenth of its reach."""
 MOST_LARGE = 0.25
 """Share of the rows from which such errors fail a fit."""
 
@@ -171,7 +172,8 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
         model: the fitted model. found: errors of positions, of rows that were held out if there are any.
         usual: median error of the rows of the fit after a geometric calibration, m.
     """
-    limit = max(LARGE_PER_REACH * model.robot.reach, LARGE_PER_USUAL * usual)
+    reach = model.robot.reach
+    limit = min(max(LARGE_PER_REACH * reach, LARGE_PER_USUAL * usual), LARGEST_ERROR_PER_REACH * reach)
     share = float((known(found.errors) > limit).double().mean())
     if share > MOST_LARGE:
         raise MeasurementError.of(
@@ -201,22 +203,22 @@ class Judgement:
     rows: int = 0
 
 
-def refuse_impossible(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
-    """Raise MeasurementError for errors that say nothing about the robot, with the likely mistake.
+def impossible_or_refused(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
+    """See :func:`~diffeo_calib.kinematics.evaluation.impossible_errors`.
 
-    Args:
-        model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
+    Raises:
+        MeasurementError: another reading of the table, or something that moved, explains the rows; it is named.
     """
     seen = positions_of(model, places, data)
     if seen is not None and found.positions is not None and impossible(model, found.positions):
         some = _refused_steps(model, seen)
         if not motions(model, some):
             refuse_mistakes(model.robot, some)
-    check_possible(model, places, data, found)
+    return impossible_errors(model, places, data, found)
 
 
 def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
-    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`refuse_impossible`.
+    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`impossible_or_refused`.
 
     Raises:
         MeasurementError: rows out of step with their joints.

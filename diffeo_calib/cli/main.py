@@ -1,8 +1,8 @@
 """The command line, and what its exit codes mean.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
-out of step with their joints (the errors are printed first), or a median error above a tenth of the robot's reach (no
-number is printed: it would not describe the robot, and a script must not take it for a result); 2 wrong usage;
+out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first), or
+`fit` found such errors in a quarter of the rows (the model is written); 2 wrong usage;
 3 the fit stopped before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is
 written).
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
@@ -60,7 +60,10 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     Raises:
         InputError: arguments of another kind, another number of joints or markers, joints of the same names in another
             order, or poses on one side and points on the other.
-        MeasurementError: too few rows of a set-up or device to place it, or readings that no place of it explains.
+        MeasurementError: too few rows of a set-up or device to place it, or a device or marker that moved far.
+
+    Warns:
+        DiffeoCalibWarning: errors of a model that no calibrated robot has, readings that no place of a device explains.
     """
     if not callable(kinematics) or isinstance(kinematics, Tree):
         expected = "a calibrated model or another function of joint values"
@@ -71,7 +74,9 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     places = place(kinematics, data)
     found = residuals(kinematics, places, data)
     if isinstance(kinematics, CalibratedKinematics):
-        check_possible(kinematics, places, data, found)
+        doubt = impossible_errors(kinematics, places, data, found)
+        if doubt is not None:
+            warn_user(doubt)
     return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
 
 
@@ -203,26 +208,30 @@ def implausibly_far(model: CalibratedKinematics, distance: float) -> bool:
     return distance > LARGEST_ERROR_PER_REACH * model.robot.reach
 
 
-def check_possible(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
-    """Raise MeasurementError for errors that say nothing about the robot.
+def impossible_errors(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
+    """A sentence about errors that say nothing about the robot; None for others.
 
     Args:
         model: a calibrated model. places, data, found: see :func:`residuals`.
+
+    Raises:
+        MeasurementError: something has moved, which explains them.
     """
     for table, _ in divided(data)[1]:
         devices = places.devices[sensor_key(table)]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
         if implausibly_far(model, float(away.median())):
-            what, got = (
-                "these errors are not those of a calibrated robot",
-                f"a median of {1e3 * float(away.median()):.4g}",
-            )
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
             fix += " (`device`, --session)"
-            raise MeasurementError.of(what, got=f"{got} mm at the ball", fix=fix)
+            got = f"a median of {1e3 * float(away.median()):.4g} mm at the ball"
+            return sentence("these errors are not those of a calibrated robot", got=got, fix=fix)
     seen = positions_of(model, places, data)
-    if seen is not None and found.positions is not None and impossible(model, found.positions):
-        raise MeasurementError(" ".join(causes_of(model, some_rows(seen), found.positions)))
+    if seen is None or found.positions is None or not impossible(model, found.positions):
+        return None
+    some = some_rows(seen)
+    if motions(model, some):
+        raise MeasurementError(" ".join(causes_of(model, some, found.positions)))
+    return implausible(model, some, found.positions)
 
 
 def some_rows(data: Measurements) -> Measurements:

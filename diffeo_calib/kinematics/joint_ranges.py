@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from typing import Any
 
 import torch
@@ -23,6 +24,8 @@ RANGE_MARGIN = 0.25
 def joints_outside_range(model: Any, q: object) -> Tensor:
     """Which joint values lie outside the range of the joint in the fit by more than a quarter of that range.
 
+    Whole turns of a revolute joint do not count: its range is the shortest arc that holds the values of the fit.
+
     Args:
         model: the calibrated model. q: (N, n) joint configurations, rad or m.
 
@@ -33,10 +36,18 @@ def joints_outside_range(model: Any, q: object) -> Tensor:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
     fitted = fitted_configurations(model)
-    q = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+    values: Tensor = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
     low, high = fitted.amin(0), fitted.amax(0)
     margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
-    return (q < low - margin) | (q > high + margin)
+    outside = (values < low - margin) | (values > high + margin)
+    turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=values.device)
+    turning = turning & (values.abs() < LARGEST_JOINT_ANGLE_RAD)  # else they are degrees
+    turns = (fitted % (2 * pi)).sort(0).values
+    gaps, last = (torch.cat([turns[1:], turns[:1] + 2 * pi]) - turns).max(0)
+    first = turns.gather(0, (last + 1)[None] % len(turns))[0]
+    arc = 2 * pi - gaps
+    margin = RANGE_MARGIN * arc + SAME_CONFIGURATION
+    return torch.where(turning, (values - first + margin) % (2 * pi) > arc + 2 * margin, outside)
 
 
 def fitted_configurations(model: object) -> Tensor:
@@ -76,9 +87,10 @@ class OutsideRange:
         self._ends = torch.stack([ends.amin(0), ends.amax(0)]) if len(ends) else ends
 
     def refuse_other_unit(self) -> None:
-        """Raise MeasurementError for joint values that look like the rows of the fit in the other unit of angles.
+        """Raise MeasurementError for joint values that are those of the fit in the other unit of angles alone.
 
-        All of them are then within the joint ranges of the fit, and as they are none is, or they hardly move. Degrees
+        All of them are then within the joint ranges of the fit, and as they are none is. A warning if some are, but
+        they hardly move. Degrees
         are larger than what an axis can turn in radians: smaller values would be in any range around zero.
         """
         for outside, (factor, words) in zip(self._outside_otherwise, ANGLE_MISTAKES, strict=True):
@@ -86,7 +98,10 @@ class OutsideRange:
             tells = tells and outside == 0 and (factor > 1.0 or self._turns_too_far())
             if tells and (self.outside == self.rows or self._moves_as_in_fit(factor)):
                 expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
-                raise MeasurementError.of("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+                text = sentence("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+                if self.outside == self.rows:
+                    raise MeasurementError(text)
+                warn_user(text)
 
     def _turns_too_far(self) -> bool:
         """Whether some axis turns further than axes do."""

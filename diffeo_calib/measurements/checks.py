@@ -41,6 +41,11 @@ def angle_mistake(words: str) -> str:
     return f"the joint values seem to be {words}; check the angle unit"
 
 
+def in_other_unit(ratio: float, tolerance: float) -> bool:
+    """Whether lengths that differ by this ratio, within a relative tolerance, are the same in mm and in m."""
+    return any(abs(ratio * factor - 1.0) < tolerance for factor in (1e-3, 1e3))
+
+
 def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
     """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
     if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:

@@ -19,7 +19,7 @@ from diffeo_calib.measurements.rows import RowTable, with_attributes
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-CAMERA_WARNED, CAMERA_REFUSED = 1.05, 1.25
+CAMERA_WARNED, CAMERA_REFUSED = 1.05, 5.0
 """Factors between the errors of corners with the given camera and with a free one, from which the images seem to show
 another camera. A focal length that is wrong by 1 % makes 1.06 of 60 images with errors of 0.2 px."""
 FEWEST_IMAGES = 8

@@ -18,7 +18,8 @@ from diffeo_calib.robots.tree import Chain, Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
-LARGEST_ANGLE_RAD = 2 * pi + 1e-6
+LARGEST_ANGLE_RAD = 4 * pi
+"""Larger ones are probably in degrees."""
 LONGEST_LINK_M = 20.0
 """Longer ones are probably in millimetres."""
 ENTRIES, MOST_ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])", 7
@@ -82,12 +83,12 @@ def from_dh(
         The chain from ``"base"`` to ``"tip"``; a :class:`Tree` if rows branch or ``tips`` are named.
 
     Raises:
-        RobotError: no row, a row of the wrong length, numbers that are not finite, angles above 2 pi, unknown
-            convention or kind, not one name per row, a row that follows itself or a later one, a tip that is no row, or
-            a mimic that :class:`Joint` or :class:`Tree` refuses.
+        RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind, not one
+            name per row, a row that follows itself or a later one, a tip that is no row, or a mimic that :class:`Joint`
+            or :class:`Tree` refuses.
 
     Warns:
-        DiffeoCalibWarning: lengths above 20 m.
+        DiffeoCalibWarning: lengths above 20 m, angles above 4 pi.
     """
     if convention not in CONVENTIONS:
         raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
@@ -178,12 +179,11 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
 
 
 def _check_units(what: str, row: Sequence[float]) -> None:
-    """Refuse degrees, and warn of millimetres, in a, alpha, d, theta, beta."""
+    """Warn of degrees and millimetres in a, alpha, d, theta, beta."""
     a, alpha, d, *others = row
     angle = max(alpha, *others, key=abs)
     if abs(angle) > LARGEST_ANGLE_RAD:
-        fix = "convert degrees: math.radians(90)"
-        raise RobotError.of(f"an angle in {what}", expected="rad, at most 2 pi", got=f"{angle:g}", fix=fix)
+        warn_user(sentence(f"an angle in {what} is {angle:g} rad", fix="convert degrees: math.radians(90)"))
     length = max(a, d, key=abs)
     if abs(length) > LONGEST_LINK_M:
         warn_user(sentence(f"a length in {what} is {length:g} m", fix="divide by 1000 if it is in mm"))

@@ -169,9 +169,10 @@ class Devices(ABC):
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
 
-    @classmethod  # noqa: B027
-    def check_start(cls, data: Readings, errors: Tensor) -> None:
-        """Raise MeasurementError for readings whose errors (N, r), m, of a rough fit show what is wrong with them."""
+    @classmethod
+    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
+        """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""
+        return False
 
     def freed(self) -> Devices | None:
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import LinearFunctionals
+from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
@@ -31,8 +32,9 @@ LARGEST_UNEXPLAINED, FEWEST_SPARE_ROWS = 1e-2, 5
 """Share of the heights' variance, and rows of a plane beyond its unknowns, that say something about their unit."""
 LEAST_SHARE = 1e-4
 """Directions of the unknowns that data determine less than this, relative to the best one, are left at zero."""
-UNIT_RATIO, CORRELATED = 10.0, 0.5
-"""Factor between measured and found heights from which a unit is wrong, and their correlation that shows it."""
+UNIT_RATIO, OTHER_UNIT, CORRELATED = 10.0, 0.5, 0.5
+"""Factor between measured and found heights that is doubted, its relative error from which it is no unit's, and their
+correlation that shows it."""
 FLAT_SHARE = 0.2
 """Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
 PARALLEL_SINE = 0.1
@@ -112,12 +114,18 @@ class Planes(Devices):
     @classmethod
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Heights per height that the tip's poses explain."""
-        _check_factor(1.0 / max(height_factor(data, R, t), 1.0))
+        factor = height_factor(data, R, t)
+        if factor > UNIT_RATIO:
+            what = f"the heights are about {factor:.3g} times larger than the robot moves along the planes' normals"
+            text = sentence(what, fix="check the unit of the heights (mm or m)")
+            if in_other_unit(factor, OTHER_UNIT):
+                raise MeasurementError(text)
+            warn_user(text)
 
     @classmethod
-    def check_start(cls, data: Readings, errors: Tensor) -> None:
+    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
         """By how much the ball's heights change per change of the measured ones."""
-        _check_factor(_factor(data, errors))
+        return not 1 / UNIT_RATIO < _factor(data, errors) < UNIT_RATIO
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """Directions that no plane faces."""
@@ -153,14 +161,6 @@ def height_factor(data: Readings, R: Tensor, t: Tensor) -> float:
         if float(unexplained) < LARGEST_UNEXPLAINED * float(heights.var()):
             factors.append(float(found[:3].norm()))
     return max(factors)
-
-
-def _check_factor(factor: float) -> None:
-    """Raise MeasurementError where heights move ``factor`` times as much along the planes' normals as was measured."""
-    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
-        times = f"{factor:.3g} times smaller" if factor > 1.0 else f"{1 / factor:.3g} times larger"
-        what = f"the heights are about {times} than the robot moves along the planes' normals"
-        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
 
 
 def _factor(data: Readings, errors: Tensor) -> float:

@@ -9,7 +9,14 @@ import torch
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
+from diffeo_calib.calibration.identification import registration
+from diffeo_calib.calibration.identification.registration import (
+    find_joint_offsets,
+    register,
+    register_robustly,
+    with_joint_offsets,
+)
+from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -47,3 +54,16 @@ def test_absorbed_offsets_are_exactly_other_joint_values() -> None:
     q = torch.randn(7, chain.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     offsets = torch.tensor([0.2, -0.05, 0.4], dtype=torch.float64)
     assert_close(with_joint_offsets(geometry, offsets).points(q), geometry.points(q + offsets), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("better", ["with", "without"])
+def test_left_out_rows_decide_on_offsets(better: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    q, points = ARM.measure(40, seed=1)
+    q[:, 2] -= 0.3
+    data, robot = dc.Measurements(q, points), ARM.nominal
+    if better == "with":
+        with pytest.warns(DiffeoCalibWarning, match="joint offsets are far .*: elbow_joint by 17.* degrees: got"):
+            assert register_robustly(robot, data).rms < 0.02
+    else:
+        monkeypatch.setattr(registration, "_left_out", lambda *_, with_offsets: 2.0 if with_offsets else 1.0)
+        assert register_robustly(robot, data).rms > 0.05  # and no warning

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +13,6 @@ from product_bank import simulated_poses, sliding_measurements, sliding_robot
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
-    NO_MISTAKE_FOUND,
     likely_mistake,
     other_columns,
     residual_of,
@@ -170,4 +170,40 @@ def test_prismatic_joints_in_another_unit() -> None:
 
 def test_honest_measurements_have_no_mistake() -> None:
     robot = sliding_robot()
-    assert advice(robot, sliding_measurements(robot, 8)) == NO_MISTAKE_FOUND
+    assert advice(robot, sliding_measurements(robot, 8)) == ""
+
+
+def test_what_a_reading_leaves_must_be_small() -> None:
+    """Of two joints that count the other way one mistake undone leaves a fifth; centimetres are no degrees."""
+    arm = SimulatedArm(seed=3)
+    q, points = arm.measure(40, seed=4)
+    one, two = torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
+    one[2], two[[2, 4]] = -1.0, -1.0
+    assert "elbow_joint seems to count" in advice(arm.nominal, dc.Measurements(q * one, points))
+    for wrong_q, wrong_points in ((q * two, points), (q, 0.01 * points), (q, 10 * points)):
+        assert advice(arm.nominal, dc.Measurements(wrong_q, wrong_points)) == ""
+
+
+def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:
+    """A column in the place of a coordinate has values where the marker is hidden."""
+    arm = SimulatedArm(seed=1, markers=3)
+    q, points = arm.measure(30, seed=2)
+    q[:, 2] += q[:, 1]
+    points[[3, 8, 20], [0, 1, 2]] = torch.nan
+    path, table = tmp_path / "t.csv", TableFormat("mm", "deg")
+    write_measurements(path, dc.Measurements(q, points, arm.nominal.joint_names), table)
+    lines = [f"{line},{'marker1_x2' if row == 0 else row}" for row, line in enumerate(path.read_text().splitlines())]
+    path.write_text("\n".join(lines) + "\n")
+    read = read_table(path, arm.nominal, [[f"marker{k}_{axis}" for axis in XYZ] for k in (1, 2, 3)], table)
+    replaced = [one for one in other_columns(arm.nominal, read) if "'marker1_x2' fits in place" in one.words]
+    assert replaced
+    for one in replaced:
+        assert torch.equal(one.points.isnan(), points.isnan())
+    assert advice(arm.nominal, read) == ""
+
+
+def test_a_reading_that_cannot_be_registered_says_nothing() -> None:
+    arm = SimulatedArm(seed=1)
+    q, points = arm.measure(30, seed=2)
+    points[2, 0, 1] = torch.nan
+    assert residual_of(arm.nominal, SimpleNamespace(q=q, points=points, on=None)) == torch.inf

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import re
 from pathlib import Path
 
 import pytest
@@ -48,12 +48,11 @@ def test_a_device_of_another_scale_is_warned_about(arm: Case, new: dc.Measuremen
 
 
 @pytest.mark.parametrize("what", ["noise", "another arm"])
-def test_rows_of_which_half_contradict_the_model_are_refused(arm: Case, new: dc.Measurements, what: str) -> None:
+def test_rows_of_which_half_contradict_the_model_are_warned_about(arm: Case, new: dc.Measurements, what: str) -> None:
     rows = noisy(new, 5e-3) if what == "noise" else measured(SimulatedArm(seed=9), 20, 5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DiffeoCalibWarning)
-        with pytest.raises(MeasurementError, match=r"of 20 new rows contradict the old model.*belongs to this robot"):
-            dc.recalibrate(arm.model, rows, drift="none")
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        dc.recalibrate(arm.model, rows, drift="none")
+    assert any(re.search("of 20 new rows contradict .*belongs to this robot", str(one.message)) for one in caught)
 
 
 def test_rows_that_leave_the_device_open_are_refused(arm: Case, new: dc.Measurements) -> None:

@@ -31,6 +31,7 @@ def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     assert quantum(values, turning=True) == (pytest.approx(step), words)
     assert quantum(arm.train.q[:, 1], turning=True) is None
     assert quantum(values[:6], turning=True) is None  # a few round numbers are no evidence
+    assert quantum(1e-6 * torch.rand(40, dtype=torch.float64), turning=True) is None  # nor is zero, of any step
 
 
 def test_the_step_of_a_slide() -> None:

@@ -88,5 +88,7 @@ def test_slides_in_the_wrong_unit_are_refused_with_the_unit_named() -> None:
     data = sliding_measurements(robot, 15)
     q = data.q.clone()
     q[:, 2] *= 1e3
-    with pytest.raises(MeasurementError, match=r"do not have the robot's size.*prismatic joints \(`joint_length`\)"):
+    with pytest.raises(
+        MeasurementError, match=r"values of prismatic joints seem to be 1000 times too .*\(`joint_length`\)"
+    ):
         dc.calibrate(robot, dc.Measurements(q, data.points, doubt=False))

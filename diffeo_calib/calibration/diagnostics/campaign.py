@@ -160,7 +160,7 @@ class RoundingLimits:
     Args:
         digits: most digits after the decimal point of a column that is looked at.
         remainder: largest distance from a multiple of the last digit, as a part of it.
-        fewest_values: different values of a column that are needed.
+        fewest_values: different multiples of the step that a column must hold.
         least: part of the remaining error from which rounding is reported. most: multiple of it beyond which it cannot
             have happened: the values were commanded with few digits, and reached.
     """
@@ -180,8 +180,6 @@ def quantum(values: Tensor, *, turning: bool, limits: RoundingLimits = ROUNDING_
 
     Steps are powers of ten, whole or half, in rad, deg, m or mm.
     """
-    if len(values.unique()) < limits.fewest_values:
-        return None
     units = (("rad", 1.0), ("degrees", pi / 180)) if turning else (("m", 1.0), ("mm", 1e-3))
     steps = [
         (step * size, f"{step:g} {unit}")
@@ -191,7 +189,8 @@ def quantum(values: Tensor, *, turning: bool, limits: RoundingLimits = ROUNDING_
     ]
     for size, words in sorted(steps, reverse=True):
         multiples = values / size
-        if float((multiples - multiples.round()).abs().max()) < limits.remainder:
+        few = len(multiples.round().unique()) < limits.fewest_values  # near the same multiple of any large step
+        if not few and float((multiples - multiples.round()).abs().max()) < limits.remainder:
             return size, words
     return None
 

@@ -1,7 +1,8 @@
 """Likely mistakes in measurements that do not fit a robot: each usual one is undone and the robot registered again.
 
-The mistake whose correction explains the measurements far better is reported. All of them concern tables and
-conventions. They are judged by the registration alone, whose few unknowns cannot compensate for them.
+The mistake without which the measurements fit far better, and as well as those of any robot, is reported. All of them
+concern tables and conventions, and are judged by the registration alone, whose few unknowns cannot compensate for
+them.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.registration import can_register, register
+from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import LONGEST_NAME, InputError, sentence, shown, warn_user
+from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, InputError, sentence, shown, warn_user
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
@@ -130,7 +132,8 @@ class MistakeLimits:
     """When a mistake counts as found.
 
     Args:
-        remaining: largest part of the residual that may remain after its correction.
+        remaining: largest part of the residual that may remain after its correction. usual: largest residual, relative
+            to the spread of the points; right readings leave 0.001 to 0.01, and one of two mistakes undone 0.1.
         decisive: part of the residual below which no other mistake is tried.
         rows: largest number of rows that are registered.
         below_tip: part of the residual that a joint below the tip must leave to be warned about; a joint that does not
@@ -140,6 +143,7 @@ class MistakeLimits:
     """
 
     remaining: float = 0.2
+    usual: float = 0.03
     decisive: float = 0.02
     rows: int = 60
     below_tip: float = 0.8
@@ -162,7 +166,7 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
         robot: n joints. data: N rows. typical: median residual of the measurements as they are, m.
 
     Returns:
-        a phrase: the mistake that explains them, if there is one, else what to check.
+        a phrase: the mistake that explains them; empty if there is none.
     """
     good: list[tuple[float, Reading]] = []
     for group in (
@@ -177,13 +181,13 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
     ):
         for reading in group(robot, data):
             residual = _residual(reading)
-            if residual < LIMITS.remaining * typical:
+            if residual < min(LIMITS.remaining * typical, LIMITS.usual * spread(reading.points)):
                 good.append((residual, reading))
             if residual < LIMITS.decisive * typical and group is not other_rotations:
                 break  # conventions may be hard to tell apart: all of them are tried
         if any(residual < LIMITS.decisive * typical or reading.partial for residual, reading in good):
             break
-    return _advice(good, typical) if good else NO_MISTAKE_FOUND
+    return _advice(good, typical) if good else ""
 
 
 def residual_of(robot: Tree, data: Measurements) -> float:
@@ -219,12 +223,15 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
 
 
 def _residual(reading: Reading) -> float:
-    """Median distance after registration of a random subset of the rows, m; infinite if the rows are too few."""
+    """Median distance after registration of a random subset of the rows, m; infinite if that cannot be done."""
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: LIMITS.rows]
-    if len(q) < 2 * (2 + reading.robot.n) or not can_register(points[rows]):
+    if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return torch.inf
-    geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
+    try:
+        geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
+    except DiffeoCalibError:
+        return torch.inf
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
 
 

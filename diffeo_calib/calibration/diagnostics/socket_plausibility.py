@@ -22,6 +22,7 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
@@ -123,10 +124,9 @@ class SocketLimits:
     Args:
         fewest_in_socket: rows of a socket; one says nothing, since its place is not known.
         surplus: rows beyond the number of sockets that are needed at least.
-        reach_share: median distance of the ball from its socket that is refused, as a part of the robot's reach.
-        unit_ratio: known over found distance, or the other way round, from which a unit must be wrong.
-        distance_share: relative error of a distance that is refused, if it also exceeds ``distance_medians`` median
-            distances of the ball from its socket.
+        reach_share: median distance of the ball from its socket that is doubted, as a part of the robot's reach.
+        distance_share: relative error of a distance that is doubted, if it also exceeds ``distance_medians`` median
+            distances of the ball from its socket; and its largest relative error in the right unit.
         turned: motion of the ball per unit of its offset, by turns of the tool in the sockets, below which its place is
             not determined along any direction. tilted: the same along one direction, which is warned about.
         wrong_medians: distance from its socket, in medians, from which a row may be in a wrong one. fits: distance from
@@ -140,7 +140,6 @@ class SocketLimits:
     fewest_in_socket: int = 2
     surplus: int = 6
     reach_share: float = 0.02
-    unit_ratio: float = 10.0
     distance_share: float = 0.1
     distance_medians: float = 5.0
     turned: float = 0.02
@@ -183,28 +182,29 @@ def check_sockets(robot: Tree, data: Measurements) -> None:
 def check_registration(
     robot: Tree, data: Measurements, found: SocketRegistration, around: Geometry | None = None
 ) -> None:
-    """Refuse rows whose ball is in no socket, or that do not determine its place; warn of a tool that never tilted.
+    """Refuse rows that fit with one mistake undone, or that do not determine where the ball is.
+
+    Warns:
+        DiffeoCalibWarning: a ball in no socket, a tool that never tilted, a known distance that is not the robot's.
 
     Args:
         robot: n joints. data: rows in sockets alone. found: their registration. around: the robot as a device saw it.
     """
-    median = float(found.distances.median())
-    share = median / _motion(robot, data.q)
-    if median > LIMITS.reach_share * robot.reach:
-        mistake = _mistake(robot, data, share, corrections_of_joints(robot, data), around)
-        raise MeasurementError.of(
-            "these rows do not fit the robot: the ball is in no socket",
-            expected=f"a spread within sockets well below {1e3 * LIMITS.reach_share * robot.reach:.3g} mm",
-            got=f"a median of {1e3 * median:.3g} mm",
-            fix=mistake
-            or "check the unit and the order of the joints, and that rows carry the names of their own sockets: of "
-            "the place and of the socket in it",
-        )
-    mistake = _mistake(robot, data, share, corrections_of_angles(robot, data.q), around)
+    median, motion = float(found.distances.median()), _motion(robot, data.q)
+    far = median > LIMITS.reach_share * robot.reach
+    tried = corrections_of_joints(robot, data) if far else corrections_of_angles(robot, data.q)
+    mistake = _mistake(robot, data, median / motion, tried, around)
+    fix = mistake or (
+        "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the place "
+        "and of the socket in it"
+    )
+    what = "these rows do not fit the robot" + ": the ball is in no socket" * far
+    expected = f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves"
+    text = sentence(what, expected=expected, got=f"a median of {1e3 * median:.3g} mm", fix=fix)
     if mistake:
-        expected = f"a spread within sockets well below the {1e3 * _motion(robot, data.q):.3g} mm that the tip moves"
-        got = f"a median of {1e3 * median:.3g} mm"
-        raise MeasurementError.of("these rows do not fit the robot", expected=expected, got=got, fix=mistake)
+        raise MeasurementError(text)
+    if far:
+        warn_user(text)
     _check_tilt(found)
     _check_distances(data, found)
 
@@ -223,7 +223,7 @@ def _mistake(
         robot, data, around: see :func:`check_registration`. share: median distance of the ball from its socket,
             relative to the motion of the tip. tried: joint values (N, n) without a mistake, and what it is.
     """
-    best, words = MISTAKES.remaining * share, ""
+    best, words = min(MISTAKES.remaining * share, MISTAKES.usual), ""
     for q, mistake in tried:
         found = register_sockets(robot if around is None else around, q, data.socket_numbers)
         left = float(found.distances.median()) / _motion(robot, q)
@@ -281,21 +281,18 @@ def _check_tilt(found: SocketRegistration) -> None:
 
 
 def _check_distances(data: Measurements, found: SocketRegistration) -> None:
-    """Refuse known distances that are not those of the robot."""
+    """Refuse known distances that are those of the robot in another unit, and warn of other ones."""
     median, sockets = float(found.distances.median()), data.known_sockets
     for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
-        ratio = length / max(seen, 1e-9)
-        name = " and ".join(f"'{sockets.names[number]}'" for number in (first, second))
-        if not 1 / LIMITS.unit_ratio < ratio < LIMITS.unit_ratio:
-            fix = "check the unit of `distances` (mm or m), and which sockets they are between"
-        elif abs(seen - length) > max(LIMITS.distance_share * length, LIMITS.distance_medians * median):
-            fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
-        else:
+        if abs(seen - length) <= max(LIMITS.distance_share * length, LIMITS.distance_medians * median):
             continue
-        what = f"the known distance of the sockets {name}"
-        expected = f"about {1e3 * seen:.4g} mm, by the robot"
-        raise MeasurementError.of(what, expected=expected, got=f"{1e3 * length:.4g} mm", fix=fix)
+        what = f"the known distance of the sockets '{sockets.names[first]}' and '{sockets.names[second]}'"
+        said = {"expected": f"about {1e3 * seen:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
+        if in_other_unit(length / max(seen, 1e-9), LIMITS.distance_share):
+            raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")
+        fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
+        warn_user(sentence(what, **said, fix=fix))
 
 
 def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:

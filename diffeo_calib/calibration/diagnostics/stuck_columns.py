@@ -7,7 +7,6 @@ the robot moves what the column tells, and the other rows contradict it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +16,7 @@ from diffeo_calib.calibration.diagnostics.plausibility import LIMITS
 from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
 
 FEWEST_ROWS = 6
 """Rows of a device from which one value in all of them says something."""
@@ -76,37 +75,22 @@ def stuck_words(stuck: Sequence[Stuck]) -> str:
     return f"{names} hold{'s' * (not several)} one value in all of {'their' if several else 'its'} rows"
 
 
-@contextmanager
-def naming_stuck(stuck: Sequence[Stuck]) -> Iterator[None]:
-    """Name the columns in the error where rows are refused."""
-    try:
-        yield
-    except MeasurementError as error:
-        if not stuck:
-            raise
-        text = str(error).removesuffix(".")
-        raise type(error)(f"{text}; {stuck_words(stuck)}: if it should move, its sensor is stuck.") from None
-
-
-def refuse_stuck(data: TangentData, stuck: Sequence[Stuck], wrong: Sequence[int]) -> None:
-    """Raise MeasurementError for columns of one value that the robot moves and most of whose rows are outliers.
+def warn_of_stuck(data: TangentData, stuck: Sequence[Stuck]) -> None:
+    """Warn of columns of one value although the robot moves what they tell.
 
     Args:
-        data: the rows around the geometric calibration. stuck: columns. wrong: numbers of the outlying rows.
+        data: the rows around the geometric calibration. stuck: columns.
     """
-    size, flags = spread(data.points.unflatten(1, (-1, 3))), torch.zeros(len(data.x), dtype=torch.bool, device=HOST)
-    flags[list(wrong)] = True
-    bad = []
+    size, bad = spread(data.points.unflatten(1, (-1, 3))), []
     for one in stuck:
         rows, shape = one.rows.to(data.values.device), (data.noise_model.bodies, -1)
         least = _smallest_motion(data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape))
-        if float(flags[one.rows].double().mean()) > LIMITS.gross_share and least > LIMITS.warned_residual * size:
-            bad.append((one, least))
+        bad += [(one, least)] if least > LIMITS.geometric_residual * size else []
     if bad:
         what = stuck_words([one for one, _ in bad])
         expected = f"values that change by {1e3 * min(least for _, least in bad):.3g} mm or more, as the robot moves"
         fix = "check the sensor and the columns, or leave these rows out"
-        raise MeasurementError.of(what, expected=expected, got="rows that the other ones contradict", fix=fix)
+        warn_user(sentence(what, expected=expected, fix=fix))
 
 
 def warn_of_outliers(wrong: Sequence[int], data: Any, reason: str, stuck: Sequence[Stuck]) -> None:

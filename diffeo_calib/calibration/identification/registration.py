@@ -30,6 +30,7 @@ from diffeo_calib.calibration.identification.identification import (
     Identification,
     Prior,
     checked_rows,
+    identify,
     in_mm,
 )
 from diffeo_calib.calibration.student_t import Tails
@@ -239,6 +240,8 @@ OFFSET_STD = 0.5
 INLIER_ERROR = 0.1
 """Error of a coordinate, relative to the median distance, beyond which Huber's loss grows linearly."""
 MAX_EVALUATIONS = 100
+FOLDS = 4
+"""Parts of the rows that are left out in turn to compare calibrations with joint offsets and without."""
 
 
 def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
@@ -333,7 +336,8 @@ class RegistrationLimits:
         examined_residual: relative residual from which joint offsets are estimated.
         remaining: largest part of the residual that may remain with offsets that are accepted.
         accepted_residual: largest relative residual that may remain with them.
-        largest_offset_rad: largest offset of a turning joint that is accepted.
+        largest_offset_rad: largest offset of a turning joint that is accepted. left_out: largest error of left-out rows
+            after a geometric calibration, in that of one without these offsets.
         reported: smallest offset that is reported, as a part of the largest.
     """
 
@@ -346,6 +350,7 @@ class RegistrationLimits:
     remaining: float = 0.3
     accepted_residual: float = 0.02
     largest_offset_rad: float = 0.8
+    left_out: float = 1.1
     reported: float = 0.2
 
 
@@ -418,6 +423,10 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
     if not explained or bool((turned.abs() > ROBUST.largest_offset_rad).any()):
         return registration
+    q, points = data.q[inliers], data.points[inliers]
+    errors = [_left_out(geometry, q, points, with_offsets=tried) for tried in (True, False)]
+    if errors[0] > ROBUST.left_out * errors[1]:
+        return registration
     text = sentence(
         f"joint offsets are far from the robot's description: {_large_offsets(chain, offsets)}",
         got=f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints",
@@ -425,6 +434,22 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
     )
     warn_user(text)
     return again
+
+
+def _left_out(geometry: Geometry, q: Tensor, points: Tensor, *, with_offsets: bool) -> float:
+    """RMS distance, m, of rows from a geometric calibration of the others, with joint offsets before it or without.
+
+    Args:
+        geometry: a registered robot. q: (N, n). points: (N, P, 3) m.
+    """
+    found, fold = [], torch.arange(len(q), device=q.device) % FOLDS
+    for number in range(FOLDS):
+        train, own = (q[fold != number], points[fold != number]), fold == number
+        start = register(geometry, *train, geometry.on).geometry
+        if with_offsets:
+            start = register(with_joint_offsets(start, find_joint_offsets(start, *train)), *train, geometry.on).geometry
+        found.append((identify(start, *train).geometry.points(q[own]) - points[own]).norm(dim=-1))
+    return float(torch.cat(found).square().nanmean().sqrt())
 
 
 def _large_offsets(chain: Tree, offsets: Tensor) -> str:

@@ -29,7 +29,7 @@ from diffeo_calib.calibration.identification.identification import (
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -46,8 +46,8 @@ LONGEST_TOOL_M = 1.0
 UNEXPLAINED = "no place of ball and devices explains the readings"
 CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
-LARGEST_SHARE = 0.02
-"""Median residual, relative to the robot's reach, of readings that belong to it."""
+LARGEST_SHARE, FAR_BETTER = 0.02, 0.2
+"""Median residual, relative to the robot's reach, that belongs to a robot; part of it that the right unit leaves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,11 @@ def identify_readings(
         rigid: whether errors of joints stay zero.
 
     Raises:
-        MeasurementError: readings that no place of ball and devices explains.
+        MeasurementError: readings that no place of ball and devices explains but in another unit, or for which none
+            is found.
+
+    Warns:
+        DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
     scale = _deviations(bare)
     still = scale.clone()
@@ -186,7 +190,9 @@ def identify_readings(
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
-    _check_size(bare, tables, worst, rough.errors)
+    doubted = [kind_of(data).doubts_unit(data, own) for data, own in zip(tables, rough.errors, strict=True)]
+    if any(doubted) or worst[0] > LARGEST_SHARE * bare.chain.reach:
+        _doubt(bare, tables, still, poses, worst)
     rms = _rms(rough.errors)
     start = rows.geometry.absorb(rough.theta)
     registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(rows.count, 1))
@@ -434,18 +440,24 @@ def _of_worst_device(tables: Sequence[Readings], errors: Sequence[Tensor]) -> tu
     )
 
 
-def _check_size(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, str], errors: Sequence[Tensor]) -> None:
-    """Raise MeasurementError for readings that no place of ball and devices explains.
+def _doubt(
+    bare: Geometry, tables: Sequence[Readings], scale: Tensor, poses: Sequence[Tensor], worst: tuple[float, str]
+) -> None:
+    """Raise MeasurementError for readings that fit in mm or m, in place of the other unit; warn if they do not.
 
     Args:
-        bare, tables: see :func:`identify_readings`.
-        worst: median residual, m, of the device where it is largest, and its name.
-        errors: predicted minus measured readings (M, r) of every table.
+        bare, tables, scale, poses: see :func:`_rough_fits`. worst: median residual, m, of the device where it is
+            largest, and its name.
     """
-    for data, own in zip(tables, errors, strict=True):
-        kind_of(data).check_start(data, own)
     (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
-    if median > most:
-        expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"
-        got = f"a median of {1e3 * median:.3g} mm at {as_written(device)}"
-        raise MeasurementError.of(UNEXPLAINED, expected=expected, got=got, fix=CHECK)
+    said = {
+        "expected": f"residuals well below {1e3 * most:.0f} mm with the robot's description",
+        "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}",
+    }
+    for factor, words in ((1e3, "small"), (1e-3, "large")):
+        other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
+        found = _rough_fits(bare, other, scale, _starts(bare.tool[0], other, poses), poses)
+        if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
+            fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
+            raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
+    warn_user(sentence(UNEXPLAINED, **said, fix=CHECK))

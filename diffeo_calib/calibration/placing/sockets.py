@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
-from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_identification, registered
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
     check_sockets,
@@ -362,7 +362,6 @@ def coordinate_stages(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, own.table.q, own.table.points)
     check_identification(own.table, identification)
-    check_deviations(own.table, registration)
     return [], own.table, (registration, identification)
 
 
@@ -395,7 +394,6 @@ def stages_by_sockets(
     identification, places = geometry_by_sockets(data, found.positions, registration)
     if device is not None and start is not None:
         check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
-        check_deviations(device, start)
         warn_of_other_robot(robot, device, start, found)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
     return places, places.placed(data), (registration, identification)

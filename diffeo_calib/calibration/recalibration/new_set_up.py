@@ -29,6 +29,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -248,8 +249,9 @@ REGISTERED_M: dict[str, float] = {"moved": PLACES.remounted_m, "other": PLACES.o
 """Prior standard deviations of the markers in the registration, m. Else the rows choose: they judge "same", too."""
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
-LARGEST_RATIO = 5.0
-"""Ratio of measured and predicted distances that only another unit explains: markers may be others."""
+LARGEST_RATIO, OTHER_UNIT = 5.0, 0.5
+"""Ratio of measured and predicted distances that is doubted, and its relative error from which it is no unit's: markers
+may be others."""
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
 UNLIKELY = 0.01
@@ -284,15 +286,20 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
 
 
 def check_size(predicted: Tensor, measured: Tensor) -> None:
-    """Raise MeasurementError for another unit of length: points (M, P, 3) by the old model, m, and measured ones."""
+    """Doubt the length unit of rows: points (M, P, 3) by the old model, m, and measured ones.
+
+    Raises:
+        MeasurementError: lengths that fit in the other unit.
+    """
     ratio = size_ratio(predicted, measured)
-    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
-        raise MeasurementError.of(
-            "the new rows do not have the robot's size",
-            expected="distances between rows as the model predicts them",
-            got=f"{ratio:.3g} times these",
-            fix="check `length` and `angle`, and the order of the columns",
-        )
+    if 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
+        return
+    what, expected = "the new rows do not have the robot's size", "distances between rows as the model predicts them"
+    fix = "check `length` and `angle`, and the order of the columns"
+    text = sentence(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
+    if in_other_unit(ratio, OTHER_UNIT):
+        raise MeasurementError(text)
+    warn_user(text)
 
 
 def size_ratio(predicted: Tensor, measured: Tensor) -> float:

@@ -41,7 +41,7 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
+from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -181,7 +181,7 @@ def recalibrate(
         drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
         rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
-    check_rows(rows, rows.excess if found is None else found.excess)
+    warn_of_contradictions(rows, rows.excess if found is None else found.excess)
     fitted = fit_both(rows, drifts, progress)
     if fitted.solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum: nothing is worth keeping
@@ -320,12 +320,10 @@ def warn_of_groups(changes: Changes) -> None:
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
 
 
-def check_rows(rows: NewRows, excess: float) -> None:
-    """Raise MeasurementError if half of the rows hardly count, and errors are larger than those of worn joints."""
+def warn_of_contradictions(rows: NewRows, excess: float) -> None:
+    """Warn if half of the rows hardly count, and errors are larger than those of worn joints."""
     bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
     if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
-        raise MeasurementError.of(
-            f"{bad} of {len(rows)} new rows contradict the old model",
-            expected="rows of the same robot, most of them right",
-            fix="check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh",
-        )
+        what = f"{bad} of {len(rows)} new rows contradict the old model"
+        fix = "check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh"
+        warn_user(sentence(what, expected="rows of the same robot, most of them right", fix=fix))

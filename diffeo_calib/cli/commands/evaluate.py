@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, refuse_impossible
+from diffeo_calib.calibration.judgement import accuracy, expected_rms, impossible_or_refused, judge
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import (
@@ -30,7 +30,7 @@ from diffeo_calib.cli.printed import (
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, TableOptions
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import warn_user
+from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -68,7 +68,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
-    refuse_impossible(model, places, data, found)
+    doubt = impossible_or_refused(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), path.name)
     if options.residuals is not None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
@@ -79,6 +79,8 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         say(line)
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
+    if doubt is not None:
+        raise MeasurementError(doubt)
     _judge(model, places, data, found)
     if limit is not None:
         accept(accuracy(model, found, used, limit.unit), limit)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -54,8 +54,6 @@ MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
 LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
-ABSURD_EXCESS = 300.0
-"""No change of a robot makes residuals so large: the rows are not what they are said to be."""
 NEGLIGIBLE_PROBABILITY = 0.01
 """Priors that are less probable count no more."""
 
@@ -129,7 +127,6 @@ def find_place(
     odds = {metres: odds for metres, odds in zip(priors, _odds(starts, priors), strict=True) if odds > 0}
     found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain) ** 0.5)
     registration = _record(found, free, before, outliers, asked=len(priors) > 1)
-    _check(registration)
     return FoundPlace(registration, odds, found.best.inflation)
 
 
@@ -349,14 +346,6 @@ def _mean_noise(session: Session, visible: Tensor) -> Tensor:
 def _rms(errors: Tensor) -> float:
     """Root mean square length of vectors (..., 3), NaN left out."""
     return float(errors.norm(dim=-1).square().nanmean().sqrt())
-
-
-def _check(found: Registration) -> None:
-    """Raise MeasurementError for errors that no change of a robot explains."""
-    if found.excess > ABSURD_EXCESS:
-        what = f"after registration the errors are still {found.excess:.0f} times as large as the model leads to expect"
-        fix = "check units, axes and order of the columns, and whether rows of joints and positions belong together"
-        raise MeasurementError.of(what, fix=fix)
 
 
 def warn_about(found: Registration, *, outliers: bool = True, excess: bool = True) -> None:

@@ -73,7 +73,7 @@ def with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) 
     """The points (N, P, 3) with other values (N,) of one coordinate of a marker, or of a pose's origin, m."""
     points, values = data.points.clone(), values.to(data.points.device)
     if data.frames is None:
-        points[:, marker, axis] = values
+        points[:, marker, axis] = values.where(~points[:, marker, axis].isnan(), torch.nan)
     elif data.board is not None and data.lever is not None:
         written = inverse_poses(data.frames)
         written[:, 0, axis, 3] = values

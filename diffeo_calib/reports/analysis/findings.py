@@ -15,7 +15,7 @@ from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.calibration.judgement import block_text, larger_than_expected, step_text, steps_of
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence
+from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -130,7 +130,7 @@ def find(
 
     Raises:
         InputError: arguments of another kind, joints in another order, or a column that the table does not have.
-        MeasurementError: errors too large to describe the robot, or too few rows of a set-up.
+        MeasurementError: rows that another reading explains far better, or too few rows of a set-up.
     """
     check_arguments(model, data)
     if data is not None:
@@ -256,7 +256,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     if impossible(model, predictions.errors):
         if not named:
             refuse_mistakes(model.robot, data)
-        raise MeasurementError(" ".join([*(named or [text or ""]), data.set_up_hint]).strip())
+        named = [" ".join([*(named or [text or ""]), data.set_up_hint]).strip()]
     if not named:
         named = [text or block_text(model, data, list(outliers)) or ""]
     if not any(named) and not outliers and not predictions.left_out:

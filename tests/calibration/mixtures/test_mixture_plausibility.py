@@ -103,7 +103,7 @@ def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, rest
     [
         (lambda t, s: [t.rows([0, 1]), s], "9 unknowns .* expected at least 3 poses"),
         (lambda t, s: [t, s.rows(slice(0, 9))], r"at least 2 rows in every socket.*, got '0/1' in 1 row"),
-        (lambda t, s: [with_attributes(t, points=1e3 * t.points), s], "do not have the robot's size"),
+        (lambda t, s: [with_attributes(t, points=1e3 * t.points), s], "positions seem to be 1000 times too large"),
         (lambda t, s: [t.with_payload(1.0), s.with_payload(0.0)], "rows with sockets: expected no payloads"),
         (lambda t, s: [t.with_payload(1.0), s], "the tables differ in payload"),
         (lambda t, s: [t, s.with_joint_names([f"q{k}" for k in range(6)])], "the tables differ in joint_names"),
