@@ -34,7 +34,7 @@ from table_mutations import MUTATIONS, ROWS, Sheet
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_joints, check_limits, registered
+from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, registered
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -168,7 +168,6 @@ def tried(sheet: Sheet, depth: Depth) -> str:
     if wrong or depth is Depth.read:
         return wrong
     found = registered(known.robot, data)
-    check_deviations(data, found)
     check_limits(known.robot, data)
     near = _rms(found.geometry.points(known.q), known.truth) < 2 * known.registered_rms
     if near and depth is Depth.registered:

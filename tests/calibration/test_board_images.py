@@ -15,9 +15,11 @@ from simulated_camera import HEIGHT, WIDTH, CameraArm, camera_arm, fixed_camera_
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -95,14 +97,14 @@ def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.04])
-def test_a_board_of_another_size_is_refused(factor: float) -> None:
+def test_a_board_of_another_size_is_warned_about(factor: float) -> None:
     corners = data().corners
     assert corners is not None
     wrong = corners.clone()
     wrong[..., :3] *= factor
     percent = "smaller" if factor < 1 else "larger"
-    with pytest.raises(MeasurementError, match=rf"size of the board.*{percent}.*caliper"):
-        dc.calibrate(arm().arm.nominal, of_corners(wrong), hyperparameters=SCALES)
+    with pytest.warns(dc.DiffeoCalibWarning, match=rf"size of the board.*{percent}.*caliper"):
+        place(arm().arm.nominal, of_corners(wrong), silent)
 
 
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
@@ -130,19 +132,21 @@ def test_joints_that_still_moved_are_warned_about() -> None:
     q[1:] = 0.9 * data().q[1:] + 0.1 * data().q[:-1]
     corners = data().corners
     assert corners is not None
-    with pytest.warns(dc.DiffeoCalibWarning) as caught:
-        dc.calibrate(arm().arm.nominal, of_corners(corners, q))
-    assert any("do not fit this robot" in str(one.message) for one in caught)
+    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit this robot"):
+        place(arm().arm.nominal, of_corners(corners, q), silent)
 
 
 def test_the_lens_of_another_camera_is_refused() -> None:
     corners, camera = data().corners, true_camera()
     assert corners is not None
     other = camera.unknowns.clone()
-    other[:2] *= 1.05
     known = replace(camera, half_size=0.0)
     of_corners(corners, camera=known)
-    with pytest.raises(MeasurementError, match=r"with the given camera.*1260"):
+    other[:2] *= 1.05
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"given camera does not quite fit.*1260"):
+        of_corners(corners, camera=replace(known, unknowns=other))
+    other[:2] *= 1.5
+    with pytest.raises(MeasurementError, match=r"with the given camera.*1890"):
         of_corners(corners, camera=replace(known, unknowns=other))
 
 

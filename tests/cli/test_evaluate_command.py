@@ -34,7 +34,7 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--length", "m"], "check the length unit"),
+        (["--length", "m"], "1000 times too large: check their unit (--length, mm or m)"),
         (["--joints", "q2,q1"], "seem to be exchanged: check the order of the joints"),
         (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
     ],
@@ -69,6 +69,19 @@ def test_the_robots_own_joints_in_another_order_are_a_mistake(
         assert done.code == 1
         assert f"in another order than the robot's: expected {','.join(names)}, got wrist_roll_joint," in done.error
         assert "leave it out: columns that are named after the joints are found wherever they are" in done.error
+
+
+def test_absurd_errors_without_a_known_mistake_are_printed(
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path
+) -> None:
+    """Joints and positions of different rows."""
+    assert fitted.code == 0
+    points = site.data.points[torch.randperm(len(site.data), generator=torch.Generator().manual_seed(0))]
+    csv = with_points(site, tmp_path / "shuffled.csv", points)
+    done = command("evaluate", site.folder / "model.safetensors", csv, *TABLE)
+    assert done.code == 1
+    assert "40 in all" in done.out
+    assert done.error.startswith("error: these errors are not those of a calibrated robot")
 
 
 def with_points(site: Site, path: Path, points: Tensor) -> Path:

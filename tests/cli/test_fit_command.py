@@ -19,11 +19,13 @@ from command_bank import (
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier, parts
+from diffeo_calib.cli.commands import fit
 from diffeo_calib.cli.printed import outlier_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.sensors.errors import Evaluation
 
 VERDICT = (STAGES[2], 0), (STAGES[2], 2), (STAGES[1], 0)
 """Stage and place of the numbers of the first line."""
@@ -233,3 +235,15 @@ def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Com
     assert any("near row 57" in line for line in done.warnings)
     assert "from the model" in done.error
     assert "session" in done.error
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_no_held_out_row_is_called_wrong_without_an_outlier(wrong: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However the errors are distributed: with few rows a larger RMS and a smaller median are no proof."""
+    said: list[str] = []
+    monkeypatch.setattr(fit, "say", said.append)
+    geometry, model = (Evaluation(1e-3 * torch.tensor([[a], [a], [b]])) for a, b in ((0.05, 0.06), (0.04, 0.09)))
+    assert model.rms > geometry.rms
+    assert model.median < geometry.median
+    fit._show_verdict(geometry, model, wrong=wrong)
+    assert ("wrong" in " ".join(said)) == wrong

@@ -135,10 +135,13 @@ def test_a_model_of_a_marker_does_not_know_the_ball(arm: Case) -> None:
         dc.evaluate(arm.result.model, data)
 
 
-def test_readings_that_are_noise_are_warned_about() -> None:
+def test_readings_that_are_noise() -> None:
     seen = dc.Readings.images(Q, 3.0 * normal(ROWS, 2, seed=3), NAMES, focal=(1.0, 1.0), centre=(0.0, 0.0))
-    with pytest.warns(dc.DiffeoCalibWarning, match="no place of the devices explains the readings"):
+    with pytest.raises(MeasurementError, match=r"no place of the devices explains the readings.*behind its camera"):
         placed(seen, points(seen.q))
+    data = readings("distance")
+    with pytest.warns(dc.DiffeoCalibWarning, match="no place of the devices explains the readings: expected residuals"):
+        placed(replace(data, values=9.0 * normal(ROWS, 1, seed=6).abs()), points(data.q))
 
 
 def test_rows_keep_together_and_are_told_apart() -> None:

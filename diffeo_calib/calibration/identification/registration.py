@@ -445,11 +445,13 @@ def _left_out(geometry: Geometry, q: Tensor, points: Tensor, *, with_offsets: bo
     found, fold = [], torch.arange(len(q), device=q.device) % FOLDS
     for number in range(FOLDS):
         train, own = (q[fold != number], points[fold != number]), fold == number
+        if not can_register(train[1]):
+            continue
         start = register(geometry, *train, geometry.on).geometry
         if with_offsets:
             start = register(with_joint_offsets(start, find_joint_offsets(start, *train)), *train, geometry.on).geometry
         found.append((identify(start, *train).geometry.points(q[own]) - points[own]).norm(dim=-1))
-    return float(torch.cat(found).square().nanmean().sqrt())
+    return float(torch.cat(found).square().nanmean().sqrt()) if found else torch.inf
 
 
 def _large_offsets(chain: Tree, offsets: Tensor) -> str:
