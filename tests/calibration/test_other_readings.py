@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -35,12 +37,12 @@ def posed() -> tuple[SimulatedArm, dc.Measurements]:
     return arm, train
 
 
-def advice(robot: dc.Chain, data: dc.Measurements) -> str:
+def advice(robot: dc.Tree, data: dc.Measurements) -> str:
     return likely_mistake(robot, data, residual_of(robot, data))
 
 
 def written_and_read(
-    folder: Path, data: dc.Measurements, robot: dc.Chain, convention: str, wrong: dict[str, object]
+    folder: Path, data: dc.Measurements, robot: dc.Tree, convention: str, wrong: dict[str, object]
 ) -> dc.Measurements:
     """Poses after they were written in one convention and read with other options."""
     unit = None if convention.startswith(("quat", "matrix")) else "deg"
@@ -180,6 +182,8 @@ def test_what_a_reading_leaves_must_be_small() -> None:
     one, two = torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
     one[2], two[[2, 4]] = -1.0, -1.0
     assert "elbow_joint seems to count" in advice(arm.nominal, dc.Measurements(q * one, points))
+    one[2] = 180 / math.pi
+    assert "elbow_joint seem to be degrees" in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
     for wrong_q, wrong_points in ((q * two, points), (q, 0.01 * points), (q, 10 * points)):
         assert advice(arm.nominal, dc.Measurements(wrong_q, wrong_points)) == ""
 
@@ -206,4 +210,5 @@ def test_a_reading_that_cannot_be_registered_says_nothing() -> None:
     arm = SimulatedArm(seed=1)
     q, points = arm.measure(30, seed=2)
     points[2, 0, 1] = torch.nan
-    assert residual_of(arm.nominal, SimpleNamespace(q=q, points=points, on=None)) == torch.inf
+    rows: Any = SimpleNamespace(q=q, points=points, on=None)
+    assert residual_of(arm.nominal, rows) == torch.inf

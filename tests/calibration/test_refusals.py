@@ -63,7 +63,7 @@ def test_a_slide_moves_relative_to_its_stroke() -> None:
         check_joints(robot, hardly)
 
 
-def doubted(robot: dc.Chain, data: dc.Measurements) -> None:
+def doubted(robot: dc.Tree, data: dc.Measurements) -> None:
     start = register_inliers(robot, data)[0].geometry
     check_identification(data, identify(start, data.q, data.points))
 

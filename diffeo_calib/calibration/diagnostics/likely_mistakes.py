@@ -288,9 +288,13 @@ def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Ten
         q = torch.where(turning, data.q, factor * data.q)
         yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
     for k, name in enumerate(names):
-        q = data.q.clone()
-        q[:, k] *= -1
-        yield q, f"{name} seems to count the other way: change the sign of its column, or of its axis"
+        tried = [(-1.0, f"{name} seems to count the other way: change the sign of its column, or of its axis")]
+        for factor, words in ANGLE_MISTAKES if robot.periodic[k] else ():
+            tried.append((factor, f"the values of {name} seem to be {words}; check its unit"))
+        for factor, words in tried:
+            q = data.q.clone()
+            q[:, k] *= factor
+            yield q, words
     for a, b in combinations(range(len(names)), 2):
         q = data.q.clone()
         q[:, [a, b]] = data.q[:, [b, a]]

@@ -460,4 +460,5 @@ def _doubt(
         if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
-    warn_user(sentence(UNEXPLAINED, **said, fix=CHECK))
+    if median > most:
+        warn_user(sentence(UNEXPLAINED, **said, fix=CHECK))
