@@ -102,7 +102,7 @@ SENTENCES = {
     "a joint never moved": Sentence("never moved in", lambda known: bool((ranges(known) < 1e-3).any())),
     "a joint hardly moved": Sentence("hardly moved in", lambda known: bool((ranges(known) < 0.06).any())),
     "one joint at a time": Sentence("one at a time in", lambda known: "one joint" in known.campaign.design.style),
-    "a place is open": Sentence("(is|are) known to .* only", open_places),
+    "a place is open": Sentence(r"(is|are) known to [^;]* only: ", open_places),
     "a flat path": Sentence("positions lie near a", flatness),
     "no errors of the robot": Sentence(
         "show no errors of the robot", lambda known: known.campaign.design.off_mm <= known.campaign.design.noise_mm
