@@ -317,6 +317,15 @@ class _StyledArm(SimulatedArm):
         return (q / step).round() * step if self.of.joints.startswith("commanded") else q
 
 
+def _of_board(of: Design) -> tuple[SimulatedArm, dc.Measurements]:
+    """Images of a board by a camera on the tool or a fixed one; or its poses, of which half are inverted by hand."""
+    on_tool, images = of.number % 2 == 0, of.kind == "board images"
+    seen = (camera_arm if on_tool or not images else fixed_camera_arm)(of.rows * 2 // 3, of.number, of.number)
+    if images:
+        return seen.arm, seen.images(of.noise_mm, on_tool=on_tool)
+    return seen.arm, seen.measured(1e-3 * of.noise_mm, 1e-2 * of.noise_mm, on_tool=on_tool)
+
+
 def _of_devices(of: Design, rng: np.random.Generator) -> Campaign:
     """Rows of other devices, by their own simulators; those that look for configurations have random ones."""
     deviation, styled = 1e-3 * of.noise_mm, _StyledArm(of, noise=1e-3 * of.noise_mm)
@@ -338,11 +347,7 @@ def _of_devices(of: Design, rng: np.random.Generator) -> Campaign:
         known: Any = {"distances": DISTANCES, "distance_std": 3e-5, "doubt": False}
         return campaign(arm, dc.Measurements.from_sockets(found.q, found.names, names, **known))
     if of.kind.startswith("board"):
-        on_tool, images = of.number % 2 == 0, of.kind == "board images"
-        seen = (camera_arm if on_tool or not images else fixed_camera_arm)(of.rows * 2 // 3, of.number, of.number)
-        if images:
-            return campaign(seen.arm, seen.images(of.noise_mm, on_tool=on_tool), (0, 1, 2))
-        return campaign(seen.arm, seen.measured(deviation, 10 * deviation, on_tool=on_tool), (0, 1, 2))
+        return campaign(*_of_board(of), (0, 1, 2))
     if of.kind == "inclinations":
         arm = _StyledArm(of, markers=3)
         q = arm.sample(of.rows // 2, 5)
