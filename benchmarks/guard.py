@@ -50,7 +50,20 @@ from robot_data import VARIABLE
 KINDS = {**guard_kinds.KINDS, **guard_cameras.KINDS}
 ARMS = (1, 2, 3)
 QUICK = (("simulated", "positions", 1), ("simulated", "heights", 1))
-FIELDS = ("error", "true", "new", "inside", "said", "alarms", "named", "expected", "seconds", "reference", "note")
+FIELDS = (
+    "error",
+    "true",
+    "new",
+    "inside",
+    "said",
+    "alarms",
+    "named",
+    "expected",
+    "distance",
+    "seconds",
+    "reference",
+    "note",
+)
 COVERAGE = 0.90, 0.99
 """Range of shares in 95 % regions."""
 Job = tuple[Any, ...]

@@ -378,7 +378,7 @@ def several_kinds(seed: int) -> Robot:
         devices = [read(arm, kind, count, seed) for kind in ("distance", "height", "image")]
         return together(tracked(arm, 20 if part == WORN else 40 if part == TRAIN else 15, part, seed, (1,)), *devices)
 
-    return built(SimulatedArm(seed, markers=2), measure, seed, (60, 30, 30, 30), order=(1, 0))
+    return built(SimulatedArm(seed, markers=2), measure, seed, (40, 30, 30, 30), order=(1, 0))
 
 
 def laser_beams(seed: int) -> Robot:
@@ -404,7 +404,7 @@ def inclinations(seed: int) -> Robot:
     def measure(arm: SimulatedArm, count: int, part: int, seed: tuple[int, int]) -> Rows:
         from inclinometer import readings  # noqa: PLC0415  # registers its kind
 
-        table = readings(arm, sampled(arm, 5 * count, (seed[0], seed[1] + 20)))
+        table = readings(arm, sampled(arm, 3 * count, (seed[0], seed[1] + 20)))
         return together(posed(arm, count, part, seed), Rows(table, table.q, {}))
 
     return built(with_frame(seed), measure, seed, (40, 40, 12, 20), order=None)

@@ -21,8 +21,8 @@ from diffeo_calib.robots import SimulatedArm
 SIZES, SPLITS, ALL_ROWS, ALL_SPLITS = (30, 60, 150), 5, 442, 2
 AGAIN_SIZES, DRAWS, OLD_ROWS = (5, 10, 20, 60), 3, 200
 SERIES = {"UR10 D": "measurements_iso_cubes.csv", "UR10 A": "measurements_grid_900.csv"}
-SOCKETS = {"panda_3": (3, 6), "kuka_14": (2, 3)}
-"""Robots that a ball in sockets measured -> every how many rows take part, and the places."""
+SOCKETS = {"panda_3": (3, 3), "kuka_14": (2, 3)}
+"""Robots that a ball in sockets measured -> every how many rows take part, and how many places are left out."""
 SHARES, SIZES_MM, WRONG_ROWS = (0.02, 0.05, 0.2), (2.0, 20.0), 120
 
 
@@ -86,7 +86,7 @@ def again(old: str, rows: int, folder: Path) -> Iterator[Record]:
 
 
 def left_out(name: str, place: int, folder: Path) -> Iterator[Record]:
-    """A place of the block is left out: spread within its sockets, and error of the known distance as the true one."""
+    """A place of the block is left out: spread within its sockets, and error of the known distance, mm."""
     robot, data = read_sockets(name, folder / "mukca")
     with (folder / "mukca" / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         places = [row["place"] for row in csv.DictReader(file)]
@@ -97,7 +97,7 @@ def left_out(name: str, place: int, folder: Path) -> Iterator[Record]:
     case: Record = {"case": name, "arm": place}
     found, spent = timed(lambda: dc.evaluate(result.model, test))
     distance = float(np.mean([abs(own.error) for own in found.distances]))
-    yield {"verb": "calibrate"} | case | seconds | {"true": 1e3 * distance}
+    yield {"verb": "calibrate"} | case | seconds | {"distance": 1e3 * distance}
     yield {"verb": "evaluate"} | case | spent | {"error": 1e3 * found.rms}
 
 

@@ -21,8 +21,8 @@ Record = dict[str, Any]
 
 `error` of held-out measurements in the unit of their device (mm, px, mrad), `true` error in mm; `new`, the share of
 held-out measurements in their 95 % regions, `inside`, that of true places, `said`, expected over true error; `alarms`,
-false ones, `named`, faults that were; `expected` mm after a plan, which is not judged; `seconds` of the processor, and
-`reference`, those of a fixed work.
+false ones, `named`, faults that were; `seconds` of the processor, and `reference`, those of a fixed work. Not judged:
+mm that are `expected` after a plan, and the error of a known `distance`.
 """
 PLANNED = {"positions": 20, "poses": 15}
 """Kinds whose robot is calibrated with so many planned rows."""

@@ -147,7 +147,7 @@ def calibrate(
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
             lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
             tell more; joint offsets are far from the robot's description; the median residual of a geometric
-            calibration exceeds 2 % of the markers' spread and no other reading explains it; a column holds one value
+            calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
             drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong

@@ -24,9 +24,9 @@ from diffeo_calib.sensors.devices import Devices, Effect, least_squares, meeting
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
 UNKNOWN_ZERO_M = 1.0
-ZERO_WARNED, ZERO_REFUSED = 1.25, 5.0
+ZERO_WARNED, ZERO_REFUSED = 1.35, 5.0
 """Factors by which a free zero lowers the noise that the geometric calibration leaves, from which the zero is warned
-about, and the readings refused. Simulated arms: 0.9 to 1.1 with the right zero, 1.3 to 1.6 with one that is 3 mm off,
+about, and the readings refused. Simulated arms: 0.9 to 1.33 with the right zero, 1.1 to 24 with one that is 3 mm off,
 2.9 to 5.2 with 10 mm; of a real UR10 or Franka 0.6 to 1.1, 0.6 to 1.1, and 0.8 to 1.5."""
 
 

@@ -68,7 +68,7 @@ def test_a_verb_that_is_slower_or_worse_on_the_whole_is_found(recorded: guard.Ca
     found["recalibrate", "positions"]["named"] = [0, 0, 0]
     _, worse = guard.judged(found, recorded, guard.Tolerance())
     assert [sentence.partition(": ")[0] for sentence in worse] == [
-        *("recalibrate", "compare", "plan"),
+        *("compare", "plan", "recalibrate"),
         "the geometric mean of errors",
     ]
 

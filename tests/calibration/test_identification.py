@@ -126,7 +126,7 @@ def test_scales_of_the_joint_errors_are_found() -> None:
         prior = identify(start, q, points).prior
         larger, smaller = sorted((prior.translation, prior.rotation), reverse=True)
         assert larger == pytest.approx(1e-3, rel=0.5)
-        assert smaller < 4e-4  # the smaller one is still falling when the noise has settled
+        assert smaller < 5e-4  # the smaller one is still falling when the noise has settled
         assert (prior.translation > prior.rotation) == (translation > rotation_size)
 
 

@@ -12,9 +12,8 @@ from tangent_bank import Setting, built, noise_covariance, normal, shaken, tange
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, ScalePrior, log_posterior
+from diffeo_calib.calibration.scales.selection import ScalePrior, log_posterior
 from diffeo_calib.process.scales import AMPLITUDES, SCALES
-from diffeo_calib.robots import SimulatedArm
 
 
 def log_prior(scales: dc.Hyperparameters, centre: dc.Hyperparameters) -> float:
@@ -115,18 +114,3 @@ def test_a_singular_covariance_has_no_posterior() -> None:
         task_lengthscale=scales.task_lengthscale * 1e4,
     )
     assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
-
-
-def test_a_singular_noise_has_no_posterior() -> None:
-    """Both scales at the ends of the range that is searched."""
-    arm = SimulatedArm(seed=1, markers=3)
-    setting = Setting(arm.nominal, dc.Measurements(*arm.measure(12, seed=2)))
-    edge = replace(
-        setting.scales,
-        sensor_noise=setting.scales.sensor_noise * math.exp(-SEARCH_LIMITS.log_range),
-        joint_noise=setting.scales.joint_noise * math.exp(SEARCH_LIMITS.log_range),
-    )
-    data = setting.tangent_data
-    assert log_posterior(edge.logarithms(), setting.scales, data) is not None
-    bare = replace(data, noise_model=replace(data.noise_model, smallest_noise=0.0))
-    assert log_posterior(edge.logarithms(), setting.scales, bare) is None

@@ -49,6 +49,16 @@ def test_points_that_tell_nothing_are_not_there() -> None:
     assert len(numbers.target) == int(SHOWN.sum())
 
 
+def test_a_point_that_any_row_depends_on_is_there() -> None:
+    """A height along x in one row and along z in the next."""
+    A = torch.zeros(2, 1, 6, dtype=torch.float64)
+    A[0, 0, 3] = A[1, 0, 5] = 1.0
+    points, one = normal(2, 6, seed=1), normal(2, 1, 4, seed=2)
+    numbers = Numbers.of(one[..., 0], points, torch.ones(2, 1).bool(), target=one[..., 0], S=one, J=one, A=A)
+    assert torch.equal(numbers.z, points[:, 3:])
+    assert torch.equal(numbers.parts[0].A[:, 0, 0], torch.eye(3, dtype=torch.float64)[[0, 2]])
+
+
 def test_values_and_blocks_there_and_back() -> None:
     numbers = table(SHOWN)
     values, blocks = normal(6, 6, 2, seed=8), normal(6, 6, 6, seed=9)

@@ -160,7 +160,8 @@ class RoundingLimits:
     Args:
         digits: most digits after the decimal point of a column that is looked at.
         remainder: largest distance from a multiple of the last digit, as a part of it.
-        fewest_values: different multiples of the step that a column must hold.
+        fewest_values: different multiples of the step that a column must hold. fewest_rows: fewer leave errors as
+            large as those of rounding, whatever the digits.
         least: part of the remaining error from which rounding is reported. most: multiple of it beyond which it cannot
             have happened: the values were commanded with few digits, and reached.
     """
@@ -168,6 +169,7 @@ class RoundingLimits:
     digits: int = 5
     remainder: float = 1e-3
     fewest_values: int = 8
+    fewest_rows: int = 20
     least: float = 0.5
     most: float = 1.5
 
@@ -217,7 +219,7 @@ def warn_of_rounding(
         step = quantum(data.q[:, k], turning=robot.periodic[k], limits=limits)
         if step is not None:
             found[k] = (name, *step)
-    if not found:
+    if not found or len(data) < limits.fewest_rows:
         return
     variances, bodies = tangent.x.new_zeros(robot.n), tangent.noise_model.bodies
     for k, (_, size, _) in found.items():

@@ -36,7 +36,8 @@ class PlausibilityLimits:
     Args:
         never_moved_m: spread of the markers below which they stand still: no device of robots repeats so well.
         registration_residual: relative residual after registration. geometric_residual: after the geometric
-            calibration; a UR10 leaves 0.001, a wrong tip link 0.1.
+            calibration; a UR10 leaves 0.001, a wrong tip link 0.1. unexplained_residual: the same, from which it is
+            warned about without another reading; noise of 1 % of the reach leaves 0.03.
         fixed_range: range of a joint, rad or strokes of at most 1 m, below which it never moved. small_range: below
             which it hardly moved.
         orientation_rad: largest plausible orientation error after the geometric calibration.
@@ -49,6 +50,7 @@ class PlausibilityLimits:
     never_moved_m: float = 1e-6
     registration_residual: float = 0.25
     geometric_residual: float = 0.02
+    unexplained_residual: float = 0.05
     fixed_range: float = 1e-3
     small_range: float = 0.05
     orientation_rad: float = 0.1
@@ -164,6 +166,8 @@ def check_identification(data: Measurements, identification: Identification) -> 
     else:
         return
     mistake = likely_mistake(identification.geometry.chain, data, typical)
+    if not mistake and what == "measurements" and typical < LIMITS.unexplained_residual * size:
+        return
     what, fix = f"the {what} do not fit this robot, even with geometric errors", mistake or NO_MISTAKE_FOUND
     text = sentence(what, expected=expected, got=got, fix=fix)
     if mistake:

@@ -247,7 +247,7 @@ class NoiseModel:
         if self.modes is not None and self.modes.shape[1] == self.bodies:
             to_body = torch.linalg.pinv(self.modes)  # (N, T, 6, 9)
             blocks = [to_body @ matrix @ to_body.mT for matrix in blocks]
-            absent = None if seen is None else (self.modes == 0.0).all(2)
+            absent = None if seen is None else (self.modes == 0.0).all(2) | ~seen[..., None]
         else:
             absent = None if self.visible is None else ~self.visible.unflatten(1, (self.bodies, -1))
         if absent is not None:
