@@ -236,7 +236,7 @@ def _selected(
     first = select(centre, data, seed=seed, progress=progress)
     # Left-out errors: scales that were chosen with gross errors among the rows let the fields explain them.
     squares = leave_one_out(data, first.scales, seed).squares
-    data = data.with_tails(reweight(squares, data.noise_model.freedom, SMALLER))
+    data = data.with_tails(reweight(squares, data.noise_model.freedom, SMALLER, kinds=data.noise_model.kinds))
     if first.interrupted:
         return first, data
     start = None if data.tails.share else first.scales
