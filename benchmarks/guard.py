@@ -50,20 +50,8 @@ from robot_data import VARIABLE
 KINDS = {**guard_kinds.KINDS, **guard_cameras.KINDS}
 ARMS = (1, 2, 3)
 QUICK = (("simulated", "positions", 1), ("simulated", "heights", 1))
-FIELDS = (
-    "error",
-    "true",
-    "new",
-    "inside",
-    "said",
-    "alarms",
-    "named",
-    "expected",
-    "distance",
-    "seconds",
-    "reference",
-    "note",
-)
+FIELDS = ("rows", "error", "true", "new", "inside", "said", "alarms", "named", "expected", "distance")
+FIELDS += ("seconds", "reference", "note")
 COVERAGE = 0.90, 0.99
 """Range of shares in 95 % regions."""
 Job = tuple[Any, ...]
