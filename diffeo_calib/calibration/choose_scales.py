@@ -42,7 +42,6 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import SMALLER, reweight
 
 
 @dataclass(frozen=True)
@@ -234,13 +233,10 @@ def _selected(
 ) -> tuple[Selection, TangentData]:
     """Scales by marginal likelihood, and the measurements with the weights that follow."""
     first = select(centre, data, seed=seed, progress=progress)
-    # Left-out errors: scales that were chosen with gross errors among the rows let the fields explain them.
-    squares = leave_one_out(data, first.scales, seed).squares
-    data = data.with_tails(reweight(squares, data.noise_model.freedom, SMALLER, kinds=data.noise_model.kinds))
+    data = data.with_tails(estimate_tails(data, first.scales, seed))
     if first.interrupted:
         return first, data
-    start = None if data.tails.share else first.scales
-    second = select(centre, data, start=start, seed=seed, progress=progress)
+    second = select(centre, data, start=first.scales, seed=seed, progress=progress)
     scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
     return replace(second, scales=scales), data

@@ -1,4 +1,9 @@
-"""Leave-one-out errors of the tangent model, and the weights of gross errors that follow from them.
+"""Errors of the tangent model that decide about outliers: weights by heavy tails, and leave-one-out errors.
+
+The weights (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are smaller.
+The second moments of the errors under the posterior are exact:
+
+    E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
 
 Large data sets are split into random blocks, each with its own Cholesky factor.
 """
@@ -7,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan
 
 import torch
 from torch import Tensor
@@ -15,8 +20,9 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import known
+from diffeo_calib.process.process import Factor
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.process.tails import Tails, reweight, weighed
 from diffeo_calib.regression.regions import region_factor
 
 BLOCK_COORDINATES = KEPT_COORDINATES
@@ -73,7 +79,7 @@ def estimate_tails(
     rounds: int = ROUNDS,
     block_coordinates: int = BLOCK_COORDINATES,
 ) -> Tails:
-    """Weights and gross errors for given scales, by expectation maximisation from the weights of the data.
+    """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
 
     Args:
         data: the measurements. scales: held fixed. seed: draws the blocks.
@@ -81,12 +87,13 @@ def estimate_tails(
         block_coordinates: largest number of measured coordinates of a block.
     """
     data = data.told
-    blocks, tails = list(_parts(data, seed, block_coordinates)), data.tails
+    blocks = [(rows, _Block(part, scales)) for rows, part in _parts(data, seed, block_coordinates)]
+    tails = data.tails
     for _ in range(rounds):
         squares = torch.empty_like(tails.weights)
-        for rows, part in blocks:
-            squares[rows] = _squares(part, scales, tails.rows(rows))
-        before, tails = tails, _reweighted(squares, data)
+        for rows, block in blocks:
+            squares[rows] = block.squares(tails.rows(rows))
+        before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
             break
     return tails
@@ -95,35 +102,23 @@ def estimate_tails(
 def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
     """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
 
-    Each block finds its own weights, and the errors with those decide. An outlier anywhere counts: no sample could
-    stand for all rows.
+    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
+    weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
     """
     data = data.told
     squares = torch.empty_like(data.tails.weights)
-    for rows in random_blocks(data, seed, BLOCK_COORDINATES):
-        part = data.rows(rows)
-        tails = part.tails
-        for _ in range(ROUNDS):
-            squares[rows] = _squares(part, scales, tails)
-            before, tails = tails, _reweighted(squares[rows], part)
+    blocks = random_blocks(data, seed, BLOCK_COORDINATES)
+    for rows in blocks:
+        squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
+    first = reweight(squares, data.noise_model.freedom)
+    for rows in blocks if first.freedom < inf else ():
+        block, tails = _Block(data.rows(rows), scales), first.rows(rows)
+        for _ in range(ROUNDS - 1):
+            squares[rows] = block.squares(tails)
+            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
             if _settled(before, tails):
                 break
-    return _reweighted(squares, data)
-
-
-def _reweighted(squares: Tensor, data: TangentData) -> Tails:
-    """Weights of left-out errors; every kind of device has gross errors of its own."""
-    return reweight(squares, data.noise_model.freedom, kinds=data.noise_model.kinds)
-
-
-def _squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
-    """Squared left-out errors with these weights, in units of what is predicted for a good measurement: (N, bodies).
-
-    Squares of the errors under the posterior would not do: they hold the fields' own uncertainty, so that a row that
-    once weighs little goes on looking gross.
-    """
-    part.expected(scales)  # the same for all weights
-    return _left_out(part.with_tails(tails), scales)[1]
+    return reweight(squares, data.noise_model.freedom)
 
 
 def _settled(before: Tails, after: Tails) -> bool:
@@ -160,6 +155,25 @@ def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Ten
         yield torch.arange(len(data.x), device=data.x.device), data
     else:
         yield from ((rows, data.rows(rows)) for rows in blocks)
+
+
+class _Block:
+    """Everything about one block that does not depend on the weights."""
+
+    def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
+        self.noise_model, self.numbers = data.noise_model, data.numbers
+        self.noise, self.expected = data.noise(scales), data.expected(scales)
+
+    def squares(self, tails: Tails) -> Tensor:
+        """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
+        numbers, weighted = self.numbers, self.noise_model.weighted(self.noise, tails)
+        noise = numbers.blocks_of_table(weighted)
+        factor = Factor.of(numbers.add_blocks(self.expected.fields.clone(), noise), self.expected.features)
+        mu = numbers.in_table(factor.solve(numbers.target[:, None])[:, 0])
+        inverse = numbers.blocks_in_table(numbers.diagonal_blocks(factor.inverse))
+        residual = weighted @ mu[:, :, None]
+        moments = residual @ residual.mT + weighted - weighted @ inverse @ weighted
+        return self.noise_model.squares(self.noise, moments)
 
 
 def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:
