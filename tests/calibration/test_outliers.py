@@ -13,6 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
 FAR = "far from where the other rows predict it"
@@ -230,3 +231,23 @@ def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: C
     scales = ur10_150.result.selection.scales
     result = dc.calibrate(ur10_150.robot, dc.Measurements(q, ur10_150.train.points), hyperparameters=scales)
     assert held_out(result, ur10_150.test) < 1.1 * ur10_150.held_out()[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
+    """With Student's t a third of the true places was inside at 5 %."""
+    arm, rng, rows = SimulatedArm(seed=3), np.random.default_rng(3), 120
+    q = arm.sample(rows + 200, 3)
+    true = arm.true_points(q)
+    points = true + torch.from_numpy(arm.noise * rng.standard_normal(tuple(true.shape)))
+    wrong = rng.permutation(rows)[: round(share * rows)]
+    for row in wrong.tolist():
+        points[row] += aside(0.02, row)
+    result = dc.calibrate(arm.nominal, dc.Measurements(q[:rows], points[:rows]))
+    assert result.tails.gross
+    assert {outlier.row for outlier in result.outliers} == set(wrong.tolist())
+    mean, covariance = result.model.predict(q[rows:], noise=False)
+    error = (true[rows:] - mean).flatten(1)[..., None]
+    inside = (error.mT @ torch.linalg.solve(covariance, error)).flatten() < 7.8147
+    assert float(inside.double().mean()) >= 0.9

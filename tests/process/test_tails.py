@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from diffeo_calib.process.tails import FREEDOM_PRIOR, FreedomPrior, Tails, reweight
+from diffeo_calib.process.tails import FREEDOM_PRIOR, FreedomPrior, Tails, gross_weights, reweight
 
 
 def simulated(count: int, dim: int, freedom: float, scale: float = 1.0, seed: int = 0) -> Tensor:
@@ -156,3 +156,46 @@ def test_no_tails_and_rows() -> None:
     assert some.rows(torch.tensor([2, 0])).weights.tolist() == [[4.0, 5.0], [0.0, 1.0]]
     assert some.rows(slice(1, 2)).weights.tolist() == [[2.0, 3.0]]
     assert some.rows(slice(1, 2)).freedom == 3.0
+
+
+# --- good or gross ------------------------------------------------------------------------------------------------
+
+
+def contaminated(share: float, size: float, dim: int, scale: float = 1.0, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Squares (200, 1) of errors whose good ones have the variance ``scale``, and which of them are gross."""
+    errors, gross = simulated(200, dim, inf, scale**0.5, seed), torch.zeros(200, dtype=torch.bool)
+    gross[np.random.default_rng(seed).permutation(200)[: round(200 * share)]] = True
+    errors[gross] += size * simulated(int(gross.sum()), dim, inf, 1.0, seed + 1)
+    return errors.square().sum(1, keepdim=True), gross
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+@pytest.mark.parametrize("dim", [1, 3, 6])
+@pytest.mark.parametrize(("share", "size"), [(0.02, 1e3), (0.05, 40.0), (0.2, 100.0), (0.3, 1e3)])
+def test_gross_errors_lose_their_weight_and_good_ones_gain_none(
+    share: float, size: float, dim: int, scale: float
+) -> None:
+    """Also where the noise is said to be ten times too large, as scales are that were chosen with gross errors."""
+    squares, gross = contaminated(share, size, dim, scale, seed=dim)
+    weights = gross_weights(squares, dim)
+    assert weights is not None
+    assert float(weights.max()) <= 1.0
+    clear = gross[:, None] & (squares > 25 * scale * dim)
+    assert float(weights[clear].max()) < 0.05
+    assert float(weights[~gross].min()) > 0.5
+
+
+@pytest.mark.parametrize("dim", [1, 3, 6])
+@pytest.mark.parametrize("freedom", [3.0, 8.0, inf])
+def test_heavy_tails_and_clean_errors_are_not_gross(freedom: float, dim: int) -> None:
+    for seed in range(10):
+        assert gross_weights(simulated(120, dim, freedom, seed=seed).square().sum(1, keepdim=True), dim) is None
+
+
+def test_hidden_markers_and_bodies_of_several_dimensions() -> None:
+    squares, gross = contaminated(0.05, 100.0, 3)
+    squares, dim = torch.cat([squares, torch.full_like(squares, torch.nan)], 1), torch.tensor([[3, 6]]).expand(200, 2)
+    weights = gross_weights(squares, dim)
+    assert weights is not None
+    assert bool((weights[:, 1] == 1.0).all())
+    assert torch.equal(weights[:, 0] < 0.5, gross)
