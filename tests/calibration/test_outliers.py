@@ -95,7 +95,7 @@ def test_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case, clean: f
     assert (found.number, found.reason) == (107, FAR)
     assert found.distance == pytest.approx(0.05, rel=0.01)
     assert found.weight < 1e-4
-    assert result.tails.freedom < 10
+    assert result.tails.gross
     kept_all(result, with_row_7_wrong(arm))
 
 
@@ -144,16 +144,15 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
 
 
 @pytest.mark.slow
-def test_an_outlier_among_repeats_is_recognised(arm: Case, clean: float) -> None:
+def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     robot, train, test = simulated(60)
-    scales = arm.result.selection.scales
     q = torch.cat([train.q, train.q[:20]])
     more = robot.true_points(train.q[:20]) + 2e-5 * torch.from_numpy(
         np.random.default_rng(3).standard_normal((20, 1, 3))
     )
     points = torch.cat([train.points, more])
     points[5] += aside(0.003, 5)
-    result = dc.calibrate(robot.nominal, dc.Measurements(q, points), hyperparameters=scales)
+    result = dc.calibrate(robot.nominal, dc.Measurements(q, points))
     assert [outlier.row for outlier in result.outliers] == [5]
     assert "repeated measurements of this pose agree with the model" in result.outliers[0].reason
     assert held_out(result, test) < 1.1 * clean
@@ -248,6 +247,6 @@ def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
     assert result.tails.gross
     assert {outlier.row for outlier in result.outliers} == set(wrong.tolist())
     mean, covariance = result.model.predict(q[rows:], noise=False)
-    error = (true[rows:] - mean).flatten(1)[..., None]
-    inside = (error.mT @ torch.linalg.solve(covariance, error)).flatten() < 7.8147
+    error = (true[rows:] - mean)[..., None]
+    inside = (error.mT @ torch.linalg.solve(covariance.view(-1, 1, 3, 3), error)).flatten() < 7.8147
     assert float(inside.double().mean()) >= 0.9
