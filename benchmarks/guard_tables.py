@@ -59,7 +59,7 @@ def calibrated(name: str, rows: int, split: int, folder: Path) -> Iterator[Recor
         train = train.rows(drawn_rows(len(train), rows, split)[0])
     result, seconds = timed(lambda: dc.calibrate(robot, train))
     case: Record = {"case": f"{name}, {rows} rows" if rows else name, "arm": split}
-    yield {"verb": "calibrate"} | case | seconds | of_measured(result.model, test)
+    yield {"verb": "calibrate"} | case | seconds | {"rows": len(train)} | of_measured(result.model, test)
     found, seconds = timed(lambda: dc.evaluate(result.model, test))
     yield {"verb": "evaluate"} | case | seconds | {"error": 1e3 * found.rms}
 
@@ -97,7 +97,7 @@ def left_out(name: str, place: int, folder: Path) -> Iterator[Record]:
     case: Record = {"case": name, "arm": place}
     found, spent = timed(lambda: dc.evaluate(result.model, test))
     distance = float(np.mean([abs(own.error) for own in found.distances]))
-    yield {"verb": "calibrate"} | case | seconds | {"distance": 1e3 * distance}
+    yield {"verb": "calibrate"} | case | seconds | {"rows": len(train), "distance": 1e3 * distance}
     yield {"verb": "evaluate"} | case | spent | {"error": 1e3 * found.rms}
 
 
@@ -113,4 +113,9 @@ def contaminated(seed: int, share: float, size_mm: float) -> Iterator[Record]:
     case = f"{100 * share:.0f} % of rows off by {size_mm:.0f} mm"
     found = {int(own.row) for own in result.outliers}
     named = {"named": len(found & set(wrong.tolist())), "alarms": len(found - set(wrong.tolist()))}
-    yield {"verb": "calibrate", "case": case, "arm": seed} | seconds | named | judged(robot, result.model, TRAIN)
+    yield (
+        {"verb": "calibrate", "case": case, "arm": seed, "rows": WRONG_ROWS}
+        | seconds
+        | named
+        | judged(robot, result.model, TRAIN)
+    )

@@ -22,7 +22,7 @@ Record = dict[str, Any]
 `error` of held-out measurements in the unit of their device (mm, px, mrad), `true` error in mm; `new`, the share of
 held-out measurements in their 95 % regions, `inside`, that of true places, `said`, expected over true error; `alarms`,
 false ones, `named`, faults that were; `seconds` of the processor, and `reference`, those of a fixed work. Not judged:
-mm that are `expected` after a plan, and the error of a known `distance`.
+`rows` of a calibration, mm that are `expected` after a plan, and the error of a known `distance`.
 """
 PLANNED = {"positions": 20, "poses": 15}
 """Kinds whose robot is calibrated with so many planned rows."""
@@ -161,7 +161,7 @@ def _calibrate(name: str, robot: Robot, models: list[Any]) -> Record:
     result, seconds = timed(lambda: dc.calibrate(robot.nominal, robot.rows[TRAIN].table))
     models.append(result.model)
     found = judged(robot, result.model, TRAIN) | held_out(robot, result.model, robot.rows[NEW])
-    return seconds | found
+    return seconds | {"rows": len(robot.rows[TRAIN].table)} | found
 
 
 def _evaluate(name: str, robot: Robot, models: list[Any]) -> Record:

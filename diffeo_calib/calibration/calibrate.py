@@ -299,7 +299,7 @@ def _summary(
         diffeomorphic_rms=calibrated,
         leave_one_out_rms=left_out,
         outliers=len(found),
-        gross_share=chosen.data.tails.share,
+        noise_degrees_of_freedom=chosen.data.tails.freedom,
         coupling_residual=fitted.coupling_residual,
         end_residual=fitted.end_residual,
         energy=fitted.energy,

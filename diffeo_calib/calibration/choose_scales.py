@@ -42,7 +42,6 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import SMALLER, reweight
 
 
 @dataclass(frozen=True)
@@ -119,16 +118,25 @@ def choose_scales(
     if len(rows) < len(data.x):
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
-        return _of_all_rows(chosen, data, seed)
+        data = data.with_gear_lines(chosen.selection.scales.lines)
+        data = data.with_tails(tails_of_many(data, chosen.selection.scales, seed))
+        return replace(chosen, data=data, left_out=leave_one_out(data, chosen.selection.scales, seed))
     if given is not None:
-        return _given(given, data, seed)
+        data = data.with_gear_lines(given.lines)
+        data = data.with_tails(estimate_tails(data, given, seed))
+        left_out = leave_one_out(data, given, seed)
+        _warn_of_wrong_scales(data, left_out)
+        return ChosenScales(Selection(given, "given"), data, left_out)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
     if models:
         found, data = _of_models(models, centre, data, seed)
         return _inflated(found, None, data, measurements, seed=seed, progress=progress)
     if poses < LIMITS.fewest_poses:
-        found = _defaults_of_few(centre, poses, len(measurements))
+        count = f"{poses} poses" if poses == len(measurements) else f"{poses} different poses"
+        fix = f"measure at least {LIMITS.fewest_poses} poses, better 60; trust held-out errors only"
+        warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
+        found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
         found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
@@ -176,23 +184,6 @@ def _inflated(
     return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales)
 
 
-def _given(scales: Hyperparameters, data: TangentData, seed: int) -> ChosenScales:
-    """Given scales, and the weights that follow."""
-    data = data.with_gear_lines(scales.lines)
-    data = data.with_tails(estimate_tails(data, scales, seed))
-    left_out = leave_one_out(data, scales, seed)
-    _warn_of_wrong_scales(data, left_out)
-    return ChosenScales(Selection(scales, "given"), data, left_out)
-
-
-def _of_all_rows(chosen: ChosenScales, data: TangentData, seed: int) -> ChosenScales:
-    """The same scales with the weights and leave-one-out errors of all rows, from those of a sample."""
-    scales = chosen.selection.scales
-    data = data.with_gear_lines(scales.lines)
-    data = data.with_tails(tails_of_many(data, scales, seed))
-    return replace(chosen, data=data, left_out=leave_one_out(data, scales, seed))
-
-
 def _inflation(
     centre: Hyperparameters | None,
     found: Selection,
@@ -220,26 +211,15 @@ def noise_of_few(data: TangentData, poses: int, registration: Identification, id
     return max(identification.noise, LIMITS.noise_share * registration.noise)
 
 
-def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selection:
-    """The defaults, with a warning."""
-    count = f"{poses} poses" if poses == rows else f"{poses} different poses"
-    text = f"{count} are too few to select scales: defaults are used"
-    fix = f"measure at least {LIMITS.fewest_poses} poses, better 60; trust held-out errors only"
-    warn_user(sentence(text, fix=fix))
-    return Selection(centre, f"defaults, since {count} are too few to select them")
-
-
 def _selected(
     centre: Hyperparameters, data: TangentData, seed: int, progress: Progress
 ) -> tuple[Selection, TangentData]:
     """Scales by marginal likelihood, and the measurements with the weights that follow."""
     first = select(centre, data, seed=seed, progress=progress)
-    # Left-out errors: scales that were chosen with gross errors among the rows let the fields explain them.
-    squares = leave_one_out(data, first.scales, seed).squares
-    data = data.with_tails(reweight(squares, data.noise_model.freedom, SMALLER))
+    data = data.with_tails(estimate_tails(data, first.scales, seed))
     if first.interrupted:
         return first, data
-    start = None if data.tails.share else first.scales
+    start = None if data.tails.gross else first.scales  # which let the fields explain gross errors
     second = select(centre, data, start=start, seed=seed, progress=progress)
     scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))

@@ -102,7 +102,7 @@ ENTRIES: dict[str, tuple[str, type]] = {
     "diffeomorphic_rms": ("diffeomorphic rms [m]", float),
     "leave_one_out_rms": ("leave-one-out rms [m]", float),
     "outliers": ("outliers", int),
-    "gross_share": ("share of gross measurements", float),
+    "noise_degrees_of_freedom": ("noise degrees of freedom", float),
     "coupling_residual": ("coupling residual", float),
     "end_residual": ("end residual", float),
     "energy": ("energy", float),
@@ -115,10 +115,8 @@ ENTRIES: dict[str, tuple[str, type]] = {
 }
 """Field of a summary -> its name in dictionaries and model files, and its type."""
 OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
-OPTIONAL = (*OF_POSITIONS, "gross_share", "effective_parameters", "length_in_doubt", "warnings")
+OPTIONAL = (*OF_POSITIONS, "noise_degrees_of_freedom", "effective_parameters", "length_in_doubt", "warnings")
 """Fields that may be None: they have no entry then. Old model files do not have the last four."""
-FORMER = ("noise degrees of freedom",)
-"""Entries of old model files that are read over."""
 LENGTH_UNIT = " [m]"
 """Ends the names of the parts' entries."""
 INFINITE = "infinite"
@@ -142,7 +140,7 @@ class Summary:
         scales: how the scales of kernels, priors and noise were chosen, in one sentence.
         rows: number of training rows.
         parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
-        gross_share: share of gross measurements that the noise model found; None in old files.
+        noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
         effective_parameters: effective number of parameters of the fit; None if it was not computed.
         length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, m; None
             without one.
@@ -161,7 +159,7 @@ class Summary:
     scales: str
     rows: int
     parts: Mapping[str, float]
-    gross_share: float | None = None
+    noise_degrees_of_freedom: float | None = None
     effective_parameters: float | None = None
     length_in_doubt: float | None = None
     warnings: str | None = None
@@ -192,7 +190,7 @@ class Summary:
         values |= {} if positions else dict.fromkeys(OF_POSITIONS)
         parts = {}
         for name, value in entries.items():
-            if name not in known and name not in FORMER:
+            if name not in known:
                 if not name.endswith(LENGTH_UNIT):
                     expected = f"{', '.join(sorted(known))}, or a part with its unit{LENGTH_UNIT}"
                     raise InputError.of("an entry of the summary", expected=expected, got=as_written(name))

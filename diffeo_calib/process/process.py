@@ -37,14 +37,22 @@ class Factor:
     def __init__(self, L: Tensor, W: Tensor) -> None:
         self.L, self.W = L, W
         eye = torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
-        self.B = torch.linalg.cholesky(eye + W.T @ W)
+        self.B, info = torch.linalg.cholesky_ex(eye + W.T @ W)
+        if int(info):
+            raise NumericalError.of("the covariance of the unknowns is not positive definite", fix=NOISE_ADVICE)
 
     @classmethod
-    def of(cls, F: Tensor, H: Tensor) -> Factor | None:
-        """Of F + H H^T; None where F is not positive definite in float64."""
+    def of(cls, F: Tensor, H: Tensor) -> Factor:
+        """Of F + H H^T.
+
+        Raises:
+            NumericalError: it is not positive definite in float64.
+        """
         with large_work(F.numel()):
             L, info = torch.linalg.cholesky_ex(F)
-            return None if int(info) else cls(L, torch.linalg.solve_triangular(L, H, upper=False))
+            if int(info):
+                raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+            return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
 
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 values (M, k)."""

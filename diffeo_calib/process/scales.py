@@ -6,24 +6,15 @@ The kernel of the joint errors is
 
 k_l (Matern 5/2) depends on joint l only and models its transmission (gear eccentricity, meshing); k_all (Gaussian)
 depends on all joints, with one length scale each, and models load and coupling. K_W is a Gaussian kernel on R^3.
-Geometric errors, the coefficients of the gravity sag and those of gear lines (gear_lines.py) have Gaussian priors. The
+Geometric errors, the coefficients of the gravity sag and those of gear lines have Gaussian priors. The
 noise of a configuration is
 
-    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, noise_model.py)
+    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation)
 
 where s is the repeatability of the joints. Without this term the likelihood would attribute repeatability to signal.
 
-Defaults follow from the residual of the geometric calibration (defaults.py). Selection starts there and maximises the
-marginal likelihood with a weak log-normal prior around the defaults (selection.py).
-
-Kernels at fixed pairs of points for many scales: values, and the derivatives of weighted sums of them by the scales.
-
-A search needs sum(W * K) and its derivatives by a dozen scales, W fixed. With squared distances d_l at length scale 1,
-rates r_l = lengthscale_l^-2 and a profile kappa these are sums over all pairs,
-
-    d/d r_l  sum W a^2 kappa(sum_l r_l d_l) = a^2 sum W kappa' d_l,
-
-so that autograd follows the scales only, not the pairs: one root and one exponential per pair give all of them.
+For the search, autograd follows the scales only, not the pairs of points: with squared distances d_l at length scale 1
+and rates r_l = lengthscale_l^-2, d/d r_l sum W a^2 kappa(sum_l r_l d_l) = a^2 sum W kappa' d_l.
 """
 
 from __future__ import annotations

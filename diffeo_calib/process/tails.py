@@ -1,120 +1,156 @@
-"""Good or gross: noise with a share of gross errors, as Gaussians whose variance differs between measurements.
+"""Noise with heavy tails: Student's t as a Gaussian whose variance differs from measurement to measurement.
 
-Errors of good measurements are N(0, R), those of gross ones N(0, c R). The share e of gross ones and c are those of the
-largest likelihood of all errors; a measurement then counts with its expected precision (expectation maximisation),
+A t-distributed error of scale 1 and nu degrees of freedom is Gaussian with variance 1 / w, w unknown. Given the
+squared distance d^2 of an error of k coordinates, in units of the noise, the expected weight is
 
-    w = P(good) + P(gross) / c,
+    w = (nu + k) / (nu + d^2),
 
-never more than a good one. Weights above one, as Student's t has them, would count as known precisions: with 5 % gross
-rows the deviations of the robot would come out half as large as its errors.
+so that a fit with heavy tails is a sequence of weighted Gaussian fits (expectation maximisation; K. Lange,
+R. Little, J. Taylor, "Robust statistical modeling using the t distribution", 1989). nu is estimated together with
+the weights. With many clean measurements it goes to infinity, where all weights are 1; with few it becomes large.
+
+Where a share e of the errors is N(0, c R), c large, and the others are N(0, R), Student's t gives the good ones weights
+of up to 2.5, which count as known precisions: with 5 % gross rows the deviations of the robot come out half as large as
+its errors. There the weights are P(good) + P(gross) / c, never more than one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from math import log
+from dataclasses import dataclass, replace
+from math import inf, log
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 
-FACTORS = torch.logspace(log(9.0), log(1e6), 40, base=torch.e, dtype=torch.float64).tolist()
-"""Candidates of c: below nine, good and gross are the same noise."""
-SHARES = (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4)
-"""Candidates of e, beside none."""
-SMALLER = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
-"""Candidates where the noise was chosen before the gross errors were known, which then made it too large."""
-EVIDENCE = 2.0
-"""Log likelihood that gross errors must gain."""
-GROSS_WEIGHT = 0.05
-"""Weight below which a measurement counts as gross: no region is meant to hold it."""
-CONFIDENCE = 0.95
-HALVINGS = 60
+
+@dataclass(frozen=True)
+class FreedomPrior:
+    """Log-normal prior of the degrees of freedom nu, and the range in which they are sought.
+
+    Args:
+        centre: most probable nu, safe for clean data and for data with outliers.
+        width_efolds: standard deviation of log nu; wide, since a handful of errors hardly determines the tails.
+        smallest: lower bound of nu; below 2 the variance is infinite.
+        gaussian: nu from which noise counts as Gaussian.
+    """
+
+    centre: float = 4.0
+    width_efolds: float = 2.0
+    smallest: float = 2.0
+    gaussian: float = 100.0
+
+
+FREEDOM_PRIOR = FreedomPrior()
+FREEDOM_GRID_POINTS = 400
+"""Points of the logarithmic grid of nu: steps of one percent."""
+BLOCK = 1 << 16
+"""Numbers of the likelihood that are added at once."""
 
 
 @dataclass(frozen=True)
 class Tails:
-    """How many measurements are gross, how large their errors are, and the resulting weight of every measurement.
+    """How heavy the tails are, and the resulting weight of every measurement.
 
     Args:
-        share: e, probability that a measurement is gross; zero for Gaussian noise.
-        factor: c, variance of gross errors relative to good ones.
-        weights: (N, P) expected precision of each marker of each row, relative to a good one: between 1 / c and 1.
+        freedom: nu, infinite for Gaussian noise.
+        weights: (N, P) expected weight of each marker of each row; about 1 for inliers.
+        gross: whether they are those of good and gross measurements.
     """
 
-    share: float
-    factor: float
+    freedom: float
     weights: Tensor
+    gross: bool = False
 
     @classmethod
     def none(cls, rows: int, markers: int, *, device: torch.device = HOST) -> Tails:
         """Gaussian noise."""
-        return cls(0.0, 1.0, torch.ones(rows, markers, dtype=torch.float64, device=device))
+        return cls(inf, torch.ones(rows, markers, dtype=torch.float64, device=device))
 
     def rows(self, index: Tensor | slice) -> Tails:
         """The tails of some rows."""
-        return Tails(self.share, self.factor, self.weights[index])
-
-    def weighed(self, squares: Tensor, dim: int | Tensor) -> Tails:
-        """The weights of other errors with the same share and factor; arguments as of :func:`reweight`."""
-        if self.share == 0.0:
-            return Tails(0.0, 1.0, torch.ones_like(squares))
-        good = torch.sigmoid(_log_odds(squares, dim, self.share, self.factor))
-        return Tails(self.share, self.factor, (good + (1.0 - good) / self.factor).nan_to_num(1.0))
-
-    def region_factor(self, dim: int) -> float:
-        """Factor on the variance of good errors whose 95 % region holds 95 % of new measurements that are not gross."""
-        if self.share == 0.0:
-            return 1.0
-        end = _largest_square(self.share, self.factor, dim)
-
-        def held(square: float) -> float:
-            wrong = chi2_probability(square / self.factor, dim)
-            return 1.0 - (1.0 - self.share) * chi2_probability(square, dim) - self.share * wrong
-
-        wanted, low, high = CONFIDENCE * held(end), 0.0, end
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if held(middle) >= wanted else (middle, high)
-        return max(high / chi2_above(1.0 - CONFIDENCE, dim), 1.0)
+        return replace(self, weights=self.weights[index])
 
 
-def reweight(squares: Tensor, dim: int | Tensor, scales: Sequence[float] = (1.0,)) -> Tails:
-    """One round of expectation maximisation: the likeliest share and size of gross errors, and the weights they imply.
+def reweight(squares: Tensor, dim: int | Tensor, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:
+    """One round of expectation maximisation: the most probable nu for these errors, and the weights it implies.
 
     Args:
         squares: (N, P) squared distances of the errors in units of the noise; NaN where hidden, with weight 1.
         dim: k, coordinates of each error, the same for all or (N, P).
-        scales: candidates of the variance of good errors in units of the noise, see :data:`SMALLER`.
+        prior: prior and range of nu.
     """
     seen = ~squares.isnan()
-    own, k = squares[seen], dim if isinstance(dim, int) else dim[seen]
+    freedom = _freedom(squares[seen], dim if isinstance(dim, int) else dim[seen], prior)
+    return weighed(squares, dim, inf if freedom >= prior.gaussian else freedom)
+
+
+def weighed(squares: Tensor, dim: int | Tensor, freedom: float) -> Tails:
+    """The weights that known degrees of freedom imply; arguments as of :func:`reweight`."""
+    if freedom == inf:
+        return Tails(inf, torch.ones_like(squares))
+    weights = (freedom + dim) / (freedom + squares)
+    return Tails(freedom, weights.nan_to_num(1.0))
+
+
+def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
+    """Maximise the likelihood of t-distributed errors, times the prior, over nu on a logarithmic grid.
+
+    The likelihood is that of the errors alone. That of errors and weights together would converge slowly (C. Liu,
+    D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
+    """
+    low, high = log(prior.smallest), log(1.01 * prior.gaussian)
+    grid = torch.logspace(low, high, FREEDOM_GRID_POINTS, base=torch.e, dtype=squares.dtype, device=squares.device)
+    value = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
+    of_dim = {dim: squares} if isinstance(dim, int) else {int(k): squares[dim == k] for k in dim.unique()}
+    for k, own in of_dim.items():
+        half = (grid + k) / 2.0
+        parts = grid[:, None].split(max(1, BLOCK // max(1, own.numel())))
+        distances = torch.cat([(own / nu).log1p().sum(1) for nu in parts])
+        density = torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * k * grid.log()
+        value = value + own.numel() * density - half * distances
+    return float(grid[int(value.argmax())])
+
+
+FACTORS = torch.logspace(log(25.0), log(1e6), 35, base=torch.e, dtype=torch.float64).tolist()
+SHARES = (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4)
+VARIANCES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+"""Candidates of c, e, and the variance of good errors: noise chosen with gross ones among them is too large."""
+FREEDOMS = torch.logspace(log(2.0), log(200.0), 20, base=torch.e, dtype=torch.float64).tolist()
+EVIDENCE = 5.0
+"""Log likelihood by which good and gross must explain errors better than Student's t."""
+
+
+def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
+    """Weights (N, P) of good and gross measurements; None where Student's t explains the errors nearly as well.
+
+    Args:
+        squares, dim: of left-out errors, see :func:`reweight`. Errors under the posterior would not do: they hold the
+            fields' own uncertainty, so that a row that once weighs little goes on looking gross.
+    """
+    seen = ~squares.isnan()
+    d2, k = squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
+    best, found = -inf, (0.0, 1.0, 1.0)
+    student = max(_student(d2 / s, k, nu) - 0.5 * float(k.sum()) * log(s) for s in VARIANCES for nu in FREEDOMS)
     shares = squares.new_tensor(SHARES)[:, None]
-    best, found = EVIDENCE, (0.0, 1.0, 1.0)
-    for scale in scales:
-        smaller = -0.5 * (own * (1.0 / scale - 1.0) + k * log(scale))
-        for factor in FACTORS:
-            gross = shares.log() - _log_odds(own / scale, k, 0.5, factor)
-            gain = (torch.logaddexp((1.0 - shares).log(), gross) + smaller).sum(1)
-            if float(gain.max()) > best:
-                best, found = float(gain.max()), (SHARES[int(gain.argmax())], factor, scale)
-    share, factor, scale = found
-    return Tails(share, factor, squares).weighed(squares / scale, dim)
+    for s in VARIANCES:
+        good = -0.5 * (d2 / s + k * log(s))
+        for c in FACTORS:
+            gross = -0.5 * (d2 / (c * s) + k * log(c * s))
+            value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(1)
+            if float(value.max()) > best:
+                best, found = float(value.max()), (SHARES[int(value.argmax())], c, s)
+    if best < student + EVIDENCE:
+        return None
+    share, c, s = found
+    odds = log((1.0 - share) / share) + 0.5 * dim * log(c) - 0.5 * squares / s * (1.0 - 1.0 / c)
+    good = torch.sigmoid(odds)
+    return (good + (1.0 - good) / c).nan_to_num(1.0)
 
 
-def _log_odds(squares: Tensor, dim: int | Tensor, share: float, factor: float) -> Tensor:
-    """log P(good) / P(gross), like the squares."""
-    spread = 0.5 * dim * log(factor)
-    return log((1.0 - share) / share) + spread - 0.5 * squares * (1.0 - 1.0 / factor)
-
-
-def _largest_square(share: float, factor: float, dim: int) -> float:
-    """The squared distance from which a measurement counts as gross; a very large one if none does."""
-    if factor * GROSS_WEIGHT <= 1.0:
-        return 1e3 * factor
-    good = (GROSS_WEIGHT - 1.0 / factor) / (1.0 - 1.0 / factor)
-    odds = log((1.0 - share) / share) + 0.5 * dim * log(factor) - log(good / (1.0 - good))
-    return 2.0 * odds / (1.0 - 1.0 / factor)
+def _student(squares: Tensor, dim: Tensor, freedom: float) -> float:
+    """Log likelihood of Student's t, but for the constants of a Gaussian."""
+    half, nu = 0.5 * (freedom + dim), torch.tensor(0.5 * freedom, dtype=squares.dtype)
+    level = torch.lgamma(half) - torch.lgamma(nu) - 0.5 * dim * nu.log()
+    return float((level - half * (squares / freedom).log1p()).sum())

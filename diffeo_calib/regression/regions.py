@@ -16,6 +16,7 @@ eleven kinds and three real series.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 import torch
@@ -85,7 +86,13 @@ def region_scale(
 
 
 def region_factor(freedom: float, dim: int) -> float:
-    """Factor for the 95 % region in ``dim`` coordinates of a variance estimated with ``freedom`` degrees of freedom."""
+    """Factor on a Gaussian's variance that gives it the 95 % region of Student's t in ``dim`` coordinates.
+
+    The t-distribution is that of errors with heavy tails, or of Gaussian errors whose variance was estimated with
+    ``freedom`` degrees of freedom.
+    """
+    if freedom == inf:
+        return 1.0
     return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 

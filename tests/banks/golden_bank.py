@@ -238,9 +238,9 @@ def tails(result: Result) -> Numbers:
         known, rows = result.identification.tails, [found.row for found in result.outliers]
         return {"outliers": one(*rows), "geometry, weights": known.weights}
     return {
-        "tails, share": one(result.tails.share),
+        "tails, inverse freedom": one(1 / result.tails.freedom),
         "tails, weights": result.tails.weights,
-        "geometry, share": one(result.identification.tails.share),
+        "geometry, inverse freedom": one(1 / result.identification.tails.freedom),
         "geometry, weights": result.identification.tails.weights,
         "outliers": one(*(row for found in result.outliers for row in (found.row, found.marker or 0))),
     }

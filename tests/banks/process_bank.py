@@ -123,5 +123,5 @@ def case(name: str) -> Case:
     own = scales() if name == "distances" else defaults(data, placed.identification.noise, placed.identification.prior)
     weights = 0.05 + 0.95 * normal(*data.tails.weights.shape, seed=1).sigmoid()
     weights = torch.where(data.tails.weights == 1.0, weights, data.tails.weights)
-    data = replace(data, tails=Tails(0.1, 100.0, weights), place_deviation=NARROW_M_RAD)
+    data = replace(data, tails=Tails(4.0, weights), place_deviation=NARROW_M_RAD)
     return Case(data, shaken(own, 2, 0.2))

@@ -105,11 +105,11 @@ def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyper
 def weighted(setting: Setting, seed: int = 0) -> TangentData:
     """The same measurements with weights of any size, and a nominal map that sags under gravity."""
     data = setting.tangent_data
-    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.0, tuple(data.tails.weights.shape)))
+    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape)))
     theta = data.theta.clone()
     coefficients = slice(data.nominal.geometry.size, None)
     theta[coefficients] = 1e-3 * normal(len(theta[coefficients]), seed=seed)
-    return replace(data, theta=theta, tails=Tails(0.1, 100.0, weights))
+    return replace(data, theta=theta, tails=Tails(4.0, weights))
 
 
 def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:

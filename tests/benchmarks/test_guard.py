@@ -26,7 +26,7 @@ def test_a_robot_is_calibrated_as_well_as_recorded(job: Any, recorded: guard.Cas
     found = guard.cases(guard.measured(job))
     assert {verb for verb, _ in found} >= {"calibrate", "evaluate", "predict", "registered", "recalibrate", "compare"}
     rows, worse = guard.judged(found, recorded, ANY_PROCESSOR)
-    assert rows[-1]["errors"] > 5
+    assert rows[-1]["errors"] >= 5
     assert not worse
 
 

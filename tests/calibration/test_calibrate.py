@@ -77,7 +77,7 @@ def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
     left_out = result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
     assert summary.leave_one_out_rms == pytest.approx(float(left_out), rel=1e-9)
     assert summary.parts == {part.name: part.displacement for part in result.parts}
-    assert summary.gross_share == result.tails.share
+    assert summary.noise_degrees_of_freedom == result.tails.freedom
     assert summary.effective_parameters == result.leave_one_out.effective
     assert (summary.rows, summary.outliers) == (60, 0)
     assert summary.scales == result.selection.status

@@ -136,7 +136,7 @@ def test_outliers_hardly_change_the_factor() -> None:
     y[3] += 5e-3
     weights = torch.ones_like(clean.tails.weights)
     weights[3] = 1e-5
-    wrong = clean.with_measured(y).with_tails(Tails(0.05, 1e5, weights))
+    wrong = clean.with_measured(y).with_tails(Tails(4.0, weights))
     before, after = (
         cross_validated_inflation(setting.scales, setting.scales, data, groups(data), limits=BRIEF)
         for data in (clean, wrong)

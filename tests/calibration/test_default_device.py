@@ -144,7 +144,7 @@ def test_diagnostics(measured: Measured) -> None:
     same(work)
 
 
-def test_gross_errors() -> None:
+def test_student_t() -> None:
     squares = normal(20, 2, seed=3).square()
     same(lambda: reweight(squares, 3))
     same(lambda: Tails.none(3, 2))

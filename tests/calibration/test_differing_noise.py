@@ -17,6 +17,7 @@ from diffeo_calib.calibration.scales.differing_noise import differing_factor, no
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.regression.regions import region_factor
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3
@@ -121,7 +122,7 @@ def test_rows_with_known_deviations_keep_their_own() -> None:
     each = blocks(*data.y.shape, seed=8) * 1e-8
     data = replace(data, noise_model=replace(data.noise_model, known=each))
     scales = two_markers().scales
-    wanted = data.noise(scales) * data.tails.region_factor(3)
+    wanted = data.noise(scales) * region_factor(data.tails.freedom, 3)
     torch.testing.assert_close(noise_of_new_rows(data, scales), wanted, rtol=1e-12, atol=0.0)
     assert known is None
     plain = two_markers().tangent_data

@@ -87,7 +87,7 @@ def case(known: bool = False) -> Case:
     weights = torch.from_numpy(np.random.default_rng(2).uniform(0.1, 1.0, (ROWS, MARKERS)))
     weights[torch.from_numpy(HIDDEN)] = 1.0
     y = torch.where(data.points.isnan().flatten(1), full.tangent_data.values, data.points.flatten(1))
-    tangent = replace(full.tangent_data, y=y, noise_model=NoiseModel.of(data, 1e-4), tails=Tails(0.1, 100.0, weights))
+    tangent = replace(full.tangent_data, y=y, noise_model=NoiseModel.of(data, 1e-4), tails=Tails(4.0, weights))
     tangent = replace(tangent, place_deviation=PLACES)
     setting.tangent_data = tangent
     return Case(setting, tangent, shaken(full.scales, 5))

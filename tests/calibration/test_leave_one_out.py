@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 import pytest
@@ -65,8 +66,8 @@ def framed() -> Chosen:
 
 
 def weighted(data: TangentData, seed: int = 0) -> TangentData:
-    weights = np.random.default_rng(seed).uniform(0.05, 1.0, tuple(data.tails.weights.shape))
-    return data.with_tails(Tails(0.1, 100.0, torch.from_numpy(weights)))
+    weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape))
+    return data.with_tails(Tails(4.0, torch.from_numpy(weights)))
 
 
 # --- weights ------------------------------------------------------------------------------------------------------
@@ -75,8 +76,9 @@ def weighted(data: TangentData, seed: int = 0) -> TangentData:
 def test_clean_measurements_keep_their_weight(clean: Chosen) -> None:
     tails = estimate_tails(clean.data, clean.scales)
     assert tails.weights.shape == (60, 1)
-    assert tails.share == 0.0
-    assert bool((tails.weights == 1.0).all())
+    assert tails.freedom > 8
+    assert float(tails.weights.min()) > 0.3
+    assert float(tails.weights.median()) == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("by", [5e-4, 5e-2])
@@ -86,7 +88,7 @@ def test_wrong_rows_lose_their_weight(clean: Chosen, by: float) -> None:
         data = moved(data, row, slice(row % 3, row % 3 + 1), sign * by)
     tails = estimate_tails(data, clean.scales)
     good = [row for row in range(60) if row not in bad]
-    assert tails.share == pytest.approx(4 / 60, rel=0.5)
+    assert tails.freedom < 20
     assert float(tails.weights[bad].max()) < 0.1 * (5e-4 / by)
     assert float(tails.weights[good].min()) > 0.2
     errors = leave_one_out(data.with_tails(tails), clean.scales)
@@ -116,9 +118,9 @@ def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
 def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
     data = clean.moved(3, slice(0, 3), 1e-3)
     first = estimate_tails(data, clean.scales)
-    down = data.with_tails(Tails(0.0, 1.0, torch.full((60, 1), 0.5, dtype=torch.float64)))
+    down = data.with_tails(Tails(inf, torch.full((60, 1), 0.5, dtype=torch.float64)))
     again = estimate_tails(down, clean.scales)
-    assert again.share == first.share
+    assert again.freedom == pytest.approx(first.freedom, rel=0.1)
     assert_close(again.weights, first.weights, rtol=0, atol=0.05)
 
 
@@ -139,7 +141,7 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
     expected = reweight(data.noise_model.squares(data.noise(case.scales), blocks), data.noise_model.freedom)
     actual = estimate_tails(data, case.scales, rounds=1)
-    assert (actual.share, actual.factor) == (expected.share, expected.factor)
+    assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
 
 

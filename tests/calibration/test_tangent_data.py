@@ -62,7 +62,7 @@ def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(s
     moved = data.with_measured(data.y + 1e-3)
     assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
     assert_close(moved.told.noise(setting.scales), data.told.noise(setting.scales), rtol=0, atol=0)
-    halved = data.with_tails(Tails(0.1, 100.0, torch.full_like(data.tails.weights, 0.5)))
+    halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
     assert_close(halved.weighted_noise(setting.scales), 2 * data.noise(setting.scales))
     assert_close(halved.target, target, rtol=0, atol=0)
 

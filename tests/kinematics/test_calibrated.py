@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from math_bank import normal
 from product_bank import Case, noise_blocks, prior_covariance, simulated
+from scipy.stats import f
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -99,7 +101,8 @@ def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None
     _, with_noise = case.model.predict(at)
     scale = expected.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     assert float(((without - expected) / scale).abs().max()) < 0.02
-    wide = tails.region_factor(3) * simulated_quantile(noise) / CHI2_95
+    wide = 3 * float(f.ppf(0.95, 3, tails.freedom)) / CHI2_95 if math.isfinite(tails.freedom) else 1.0
+    wide *= simulated_quantile(noise) / CHI2_95
     for k in range(case.model.markers):
         added = (with_noise - without)[:, k]
         own_noise = wide * noise.mean(0)[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]

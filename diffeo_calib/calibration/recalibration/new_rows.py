@@ -31,7 +31,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.process.tails import Tails, reweight
-from diffeo_calib.regression.regions import OTHER_DATE, region_scale
+from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
@@ -175,7 +175,7 @@ class NewRows:
         return float(-0.5 * white.square().sum() - factor.diagonal().log().sum())
 
     def with_weights(self) -> NewRows:
-        """The same rows with the weights of gross errors, by expectation maximisation."""
+        """The same rows with the weights of Student's t, by expectation maximisation."""
         rows = self
         for _ in range(ROUNDS):
             tails = reweight(rows._expected_squares(), rows.noise_model.freedom)
@@ -236,7 +236,7 @@ class NewRows:
         old = self.fitted.new_noise
         if self.observe is not None or self.fitted.slopes is not None:
             return old
-        found = self._mean_noise * self.tails.region_factor(self.noise_model.largest_freedom)
+        found = self._mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
         return found if float(found.trace()) > float(old.trace()) else old
 
     @property

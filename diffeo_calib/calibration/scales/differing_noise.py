@@ -23,7 +23,7 @@ from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.regions import CONFIDENCE
+from diffeo_calib.regression.regions import CONFIDENCE, region_factor
 
 HALVINGS = 50
 """Of the interval in which the quantile lies: to the last digit."""
@@ -70,7 +70,7 @@ def _typical(data: TangentData, noise: NoiseModel, jacobian: Tensor, scales: Hyp
     """The same for a noise model of coordinates with their derivatives (N, m, n)."""
     mean, seen = noise.mean_covariance(scales, jacobian), noise.coordinates(jacobian[..., 0])
     between_rows = differing_factor(noise.covariance(scales, jacobian), mean, seen)
-    return mean * between_rows * data.tails.region_factor(noise.largest_freedom)
+    return mean * between_rows * region_factor(data.tails.freedom, noise.largest_freedom)
 
 
 def noise_of_new_rows(data: TangentData, scales: Hyperparameters) -> Tensor:
@@ -80,5 +80,5 @@ def noise_of_new_rows(data: TangentData, scales: Hyperparameters) -> Tensor:
     """
     own = data.noise(scales)
     if data.observe is not None or data.noise_model.known is not None:
-        return own * data.tails.region_factor(data.noise_model.largest_freedom)
+        return own * region_factor(data.tails.freedom, data.noise_model.largest_freedom)
     return without_hidden(new_noise(data, scales).expand_as(own), data.visible)

@@ -1,7 +1,7 @@
-"""Errors of the tangent model that decide about outliers: weights of gross errors, and leave-one-out errors.
+"""Errors of the tangent model that decide about outliers: weights by heavy tails, and leave-one-out errors.
 
-The weights (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are
-smaller. The second moments of the errors under the posterior are exact:
+The weights (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are smaller.
+The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
 
@@ -12,19 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.quantiles import known
-from diffeo_calib.process.process import Factor
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails, reweight
-from diffeo_calib.regression.conditional import NOISE_ADVICE
+from diffeo_calib.process.tails import Tails, gross_weights, reweight, weighed
 from diffeo_calib.regression.regions import region_factor
 
 BLOCK_COORDINATES = KEPT_COORDINATES
@@ -81,7 +78,7 @@ def estimate_tails(
     rounds: int = ROUNDS,
     block_coordinates: int = BLOCK_COORDINATES,
 ) -> Tails:
-    """Weights and gross errors for given scales, by expectation maximisation from the weights of the data.
+    """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
 
     Args:
         data: the measurements. scales: held fixed. seed: draws the blocks.
@@ -89,13 +86,19 @@ def estimate_tails(
         block_coordinates: largest number of measured coordinates of a block.
     """
     data = data.told
-    blocks = [(rows, _Block(part, scales)) for rows, part in _parts(data, seed, block_coordinates)]
-    tails = data.tails
+    blocks, tails = list(_parts(data, seed, block_coordinates)), data.tails
     for _ in range(rounds):
         squares = torch.empty_like(tails.weights)
-        for rows, block in blocks:
-            squares[rows] = block.squares(tails.rows(rows))
+        for rows, part in blocks:
+            squares[rows] = _expected_squares(part, scales, tails.rows(rows))
         before, tails = tails, reweight(squares, data.noise_model.freedom)
+        if _settled(before, tails):
+            break
+    for _ in range(rounds):
+        weights = gross_weights(leave_one_out(data.with_tails(tails), scales, seed).squares, data.noise_model.freedom)
+        if weights is None:
+            break
+        before, tails = tails, Tails(inf, weights, gross=True)
         if _settled(before, tails):
             break
     return tails
@@ -104,20 +107,20 @@ def estimate_tails(
 def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
     """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
 
-    Share and size of gross errors are those with the weights of the data. With these each block finds its own
+    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
     weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
     """
     data = data.told
     squares = torch.empty_like(data.tails.weights)
     blocks = random_blocks(data, seed, BLOCK_COORDINATES)
     for rows in blocks:
-        squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
+        squares[rows] = _expected_squares(data.rows(rows), scales, data.tails.rows(rows))
     first = reweight(squares, data.noise_model.freedom)
-    for rows in blocks if first.share > 0.0 else ():
-        block, tails = _Block(data.rows(rows), scales), first.rows(rows)
+    for rows in blocks if first.freedom < inf else ():
+        part, tails = data.rows(rows), first.rows(rows)
         for _ in range(ROUNDS - 1):
-            squares[rows] = block.squares(tails)
-            before, tails = tails, first.weighed(squares[rows], data.noise_model.freedom)
+            squares[rows] = _expected_squares(part, scales, tails)
+            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
             if _settled(before, tails):
                 break
     return reweight(squares, data.noise_model.freedom)
@@ -159,25 +162,15 @@ def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Ten
         yield from ((rows, data.rows(rows)) for rows in blocks)
 
 
-class _Block:
-    """Everything about one block that does not depend on the weights."""
-
-    def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
-        self.noise_model, self.numbers = data.noise_model, data.numbers
-        self.noise, self.expected = data.noise(scales), data.expected(scales)
-
-    def squares(self, tails: Tails) -> Tensor:
-        """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
-        numbers, weighted = self.numbers, self.noise_model.weighted(self.noise, tails)
-        noise = numbers.blocks_of_table(weighted)
-        factor = Factor.of(numbers.add_blocks(self.expected.fields.clone(), noise), self.expected.features)
-        if factor is None:
-            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
-        mu = numbers.in_table(factor.solve(numbers.target[:, None])[:, 0])
-        inverse = numbers.blocks_in_table(numbers.diagonal_blocks(factor.inverse))
-        residual = weighted @ mu[:, :, None]
-        moments = residual @ residual.mT + weighted - weighted @ inverse @ weighted
-        return self.noise_model.squares(self.noise, moments)
+def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
+    """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
+    part.expected(scales)  # the same for all weights
+    data, numbers = part.with_tails(tails), part.numbers
+    process, noise = data.process(scales), data.weighted_noise(scales)
+    inverse = numbers.blocks_in_table(numbers.diagonal_blocks(process.inverse))
+    residual = noise @ numbers.in_table(process.mu)[:, :, None]
+    moments = residual @ residual.mT + noise - noise @ inverse @ noise
+    return data.noise_model.squares(data.noise(scales), moments)
 
 
 def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:

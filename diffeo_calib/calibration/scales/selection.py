@@ -18,6 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.process import Factor
@@ -157,7 +158,7 @@ def log_posterior(
         centre: centre of the prior. data: the measurements. prior: its widths.
 
     Returns:
-        None where G + R, or the noise by itself, is not positive definite in float64.
+        None where G + R is not positive definite in float64.
     """
     told, numbers, point = data.told, data.numbers, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -166,8 +167,9 @@ def log_posterior(
         variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
     root = variance.detach().sqrt()
     F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
-    factor = Factor.of(F, numbers.S * root)
-    if factor is None:
+    try:
+        factor = Factor.of(F, numbers.S * root)
+    except NumericalError:
         return None
     mu = factor.solve(numbers.target[:, None])[:, 0]
     slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
