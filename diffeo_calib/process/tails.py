@@ -115,7 +115,7 @@ def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
 
 FACTORS = torch.logspace(log(25.0), log(1e6), 35, base=torch.e, dtype=torch.float64).tolist()
 SHARES = (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4)
-VARIANCES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+VARIANCES = (16.0, 4.0, 2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Candidates of c, e, and the variance of good errors: noise chosen with gross ones among them is too large."""
 FREEDOMS = torch.logspace(log(2.0), log(200.0), 20, base=torch.e, dtype=torch.float64).tolist()
 EVIDENCE = 5.0
@@ -146,6 +146,8 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     share, c, s = found
     odds = log((1.0 - share) / share) + 0.5 * dim * log(c) - 0.5 * squares / s * (1.0 - 1.0 / c)
     good = torch.sigmoid(odds)
+    if float(good[seen].mean()) < 0.5:  # noise that is said to be far too small is not gross
+        return None
     return (good + (1.0 - good) / c).nan_to_num(1.0)
 
 
