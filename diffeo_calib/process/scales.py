@@ -11,10 +11,8 @@ noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation)
 
-where s is the repeatability of the joints. Without this term the likelihood would attribute repeatability to signal.
-
-For the search, autograd follows the scales only, not the pairs of points: with squared distances d_l at length scale 1
-and rates r_l = lengthscale_l^-2, d/d r_l sum W a^2 kappa(sum_l r_l d_l) = a^2 sum W kappa' d_l.
+where s is the repeatability of the joints, which the likelihood would otherwise attribute to signal. In a search
+autograd follows the scales only: d/d r_l sum W a^2 kappa(sum_l r_l d_l) = a^2 sum W kappa' d_l, r_l = lengthscale_l^-2.
 """
 
 from __future__ import annotations

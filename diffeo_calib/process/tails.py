@@ -125,9 +125,7 @@ EVIDENCE = 5.0
 def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     """Weights (N, P) of good and gross measurements; None where Student's t explains the errors nearly as well.
 
-    Args:
-        squares, dim: of left-out errors, see :func:`reweight`. Errors under the posterior would not do: they hold the
-            fields' own uncertainty, so that a row that once weighs little goes on looking gross.
+    Squares and dim as of :func:`reweight`, of left-out errors: those under the posterior hold the fields' uncertainty.
     """
     seen = ~squares.isnan()
     d2, k = squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf
 
 import pytest
 import torch
@@ -99,8 +98,8 @@ def test_weights_of_many_rows_are_those_of_all_blocks_together(data: dc.Measurem
     assert len(leave_one_out.random_blocks(some, 0, leave_one_out.BLOCK_COORDINATES)) == ROWS // SAMPLED
     wanted = leave_one_out.estimate_tails(some, chosen, block_coordinates=leave_one_out.BLOCK_COORDINATES)
     found = leave_one_out.tails_of_many(some, chosen)
-    assert wanted.freedom < inf
-    assert found.freedom == pytest.approx(wanted.freedom, rel=0.1)
+    assert wanted.gross
+    assert found.gross
     assert int(found.weights.argmin()) == WRONG
     assert_close(found.weights, wanted.weights, rtol=0.1, atol=0)
 

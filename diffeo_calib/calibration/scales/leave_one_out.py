@@ -94,7 +94,12 @@ def estimate_tails(
         before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
             break
-    for _ in range(rounds):
+    return _among_gross(data, scales, tails, seed)
+
+
+def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
+    """The weights beside gross rows, if left-out errors show any."""
+    for _ in range(ROUNDS):
         weights = gross_weights(leave_one_out(data.with_tails(tails), scales, seed).squares, data.noise_model.freedom)
         if weights is None:
             break
@@ -123,7 +128,7 @@ def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> 
             before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
             if _settled(before, tails):
                 break
-    return reweight(squares, data.noise_model.freedom)
+    return _among_gross(data, scales, reweight(squares, data.noise_model.freedom), seed)
 
 
 def _settled(before: Tails, after: Tails) -> bool:
