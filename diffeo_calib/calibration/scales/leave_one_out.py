@@ -4,8 +4,6 @@ The weights (process/tails.py) need the errors of the measurements, not the resi
 The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
-
-Large data sets are split into random blocks, each with its own Cholesky factor.
 """
 
 from __future__ import annotations
