@@ -36,7 +36,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.poses import pose_covariances
+from diffeo_calib.measurements.poses import pose_directions
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 REPEATS, TRAINING_SHARE = 5, 0.7
@@ -94,7 +94,8 @@ class PlainCovariance:
         """(N, P, 3, 3) in m^2, or (N, 6, 6) of poses."""
         blocks = torch.cat([self._blocks(rows) for rows in q.split(PLAIN_ROWS)])
         if self.model.lever is not None:
-            return pose_covariances(blocks, self.model.poses(q), self.model.lever)
+            wanted = pose_directions(self.model.poses(q), self.model.lever)
+            return wanted @ blocks @ wanted.mT
         return torch.stack([blocks[:, k : k + 3, k : k + 3] for k in range(0, blocks.shape[1], 3)], 1)
 
     def _blocks(self, q: Tensor) -> Tensor:

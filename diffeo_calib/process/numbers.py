@@ -58,7 +58,7 @@ class Numbers:
         self.cells = torch.cat([part[6].flatten() for part in parts])
         self.J = torch.cat([part[4].flatten(0, 1) for part in parts])
         counts = [part.cells.shape for part in self.parts]
-        rows = torch.cat([torch.full((n,), r, device=self.q.device) for n, r in counts])
+        rows = torch.cat([torch.full((n,), r, dtype=torch.long, device=self.q.device) for n, r in counts])
         self.row = torch.arange(len(self.q), device=self.q.device).repeat_interleave(rows)
 
     @classmethod

@@ -113,11 +113,11 @@ def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
     return float(grid[int(value.argmax())])
 
 
-FACTORS = torch.logspace(log(25.0), log(1e6), 35, base=torch.e, dtype=torch.float64).tolist()
+FACTORS = tuple(25.0 * 4e4 ** (i / 34) for i in range(35))
 SHARES = (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4)
 VARIANCES = (16.0, 4.0, 2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Candidates of c, e, and the variance of good errors: noise chosen with gross ones among them is too large."""
-FREEDOMS = torch.logspace(log(2.0), log(200.0), 20, base=torch.e, dtype=torch.float64).tolist()
+FREEDOMS = tuple(2.0 * 100.0 ** (i / 19) for i in range(20))
 EVIDENCE = 5.0
 """Log likelihood by which good and gross must explain errors better than Student's t."""
 
@@ -151,6 +151,6 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
 
 def _student(squares: Tensor, dim: Tensor, freedom: float) -> float:
     """Log likelihood of Student's t, but for the constants of a Gaussian."""
-    half, nu = 0.5 * (freedom + dim), torch.tensor(0.5 * freedom, dtype=squares.dtype)
+    half, nu = 0.5 * (freedom + dim), squares.new_tensor(0.5 * freedom)
     level = torch.lgamma(half) - torch.lgamma(nu) - 0.5 * dim * nu.log()
     return float((level - half * (squares / freedom).log1p()).sum())

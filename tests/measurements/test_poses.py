@@ -24,7 +24,7 @@ from diffeo_calib.measurements.poses import (
     marks,
     nearest_rotations,
     numbers_of,
-    pose_covariances,
+    pose_directions,
     poses_from_marks,
     rigid_poses,
     rotation_matrices,
@@ -264,7 +264,8 @@ def test_covariances_of_poses_and_of_points_are_two_sides_of_one() -> None:
     factor = torch.from_numpy(np.random.default_rng(0).normal(size=(8, 6, 6)))
     covariance = factor @ factor.mT
     J = mark_jacobian(poses, lever)
-    assert_close(pose_covariances(J @ covariance @ J.mT, poses, lever), covariance, rtol=0, atol=1e-10)
+    wanted = pose_directions(poses, lever)
+    assert_close(wanted @ J @ covariance @ J.mT @ wanted.mT, covariance, rtol=0, atol=1e-10)
 
 
 def test_pose_covariance_is_that_of_poses_from_marks() -> None:
@@ -275,7 +276,8 @@ def test_pose_covariance_is_that_of_poses_from_marks() -> None:
     found = poses_from_marks(mark_points(pose, lever) + draws.unflatten(1, (3, 3)), lever)
     turns = rotation_numbers(found[:, :3, :3] @ pose[:, :3, :3].mT, "rotvec")
     errors = torch.cat([found[:, :3, 3] - pose[:, :3, 3], turns], 1)
-    expected = pose_covariances(torch.from_numpy(factor @ factor.T)[None], pose, lever)[0]
+    wanted = pose_directions(pose, lever)[0]
+    expected = wanted @ torch.from_numpy(factor @ factor.T) @ wanted.mT
     scale = expected.diagonal().sqrt()
     ratio = torch.cov(errors.T) / torch.outer(scale, scale)
     assert_close(ratio, expected / torch.outer(scale, scale), rtol=0, atol=0.03)

@@ -198,7 +198,7 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, parts: list[Ten
     """
     new, data = data.blocks_in_numbers(noise_of_new_rows(data, scales)), data.told
     numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
-    part = torch.full((len(data.x),), -1, device=data.x.device)
+    part = torch.full((len(data.x),), -1, dtype=torch.long, device=data.x.device)
     for number, rows in enumerate(parts):
         part[rows] = number
     groups = [(part[numbers.owner] == number).nonzero()[:, 0] for number in range(len(parts))]
