@@ -46,8 +46,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.process.scales import COUPLED_PROFILE
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.tree import Tree
 

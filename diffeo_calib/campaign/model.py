@@ -28,12 +28,12 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import rows_of_one_kind
 

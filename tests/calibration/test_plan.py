@@ -15,10 +15,10 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.plan import move_times, short_path
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 MARKER = torch.tensor([[0.1, 0.0, 0.1]], dtype=torch.float64)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices
 

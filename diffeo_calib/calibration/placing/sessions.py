@@ -31,12 +31,11 @@ from diffeo_calib.calibration.placing.placement import (
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import frame_slopes, rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.mounted import Mounted, View, mounted_kind, sessions_of

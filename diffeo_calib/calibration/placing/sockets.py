@@ -40,7 +40,6 @@ from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_use
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
@@ -48,6 +47,7 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.mounted import View

@@ -37,7 +37,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.poses import LEVER, mark_points
@@ -49,7 +49,7 @@ from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Featu
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import rigid
+from diffeo_calib.robots.se3 import frame_slopes, rigid
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import device_coordinates
 

@@ -25,7 +25,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
@@ -33,6 +33,7 @@ from diffeo_calib.maps.observation import Observation
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.bodies import Body
@@ -40,7 +40,7 @@ from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
-from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.robots.se3 import frame_slopes, rotation, transforms
 
 MAX_STEPS = 100
 SETTLED = 1e-9

@@ -48,7 +48,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
+from diffeo_calib.robots.se3 import frame_slopes, nearest_rotations, skew, transforms
 
 LARGE_EXCESS = 3.0
 """Residuals by this factor above the expected ones mean that something else has changed too."""
@@ -259,12 +259,6 @@ class RegisteredMap(FittedMap):
 def _along(directions: Tensor | None, covariance: Tensor) -> Tensor:
     """The covariance of linear functions (M, r, m) of coordinates with this covariance (M, m, m)."""
     return covariance if directions is None else directions @ covariance @ directions.mT
-
-
-def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
-    """Derivatives of points by a shift and a small turn about a centre: (N, P, 3), (3,) -> (N, 3 P, 6)."""
-    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
-    return torch.cat([eye, -skew(points - centre)], dim=-1).flatten(1, 2)
 
 
 def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:
