@@ -24,8 +24,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.mounted import MOUNTING, seen_mounted
 from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import MOUNTING, seen_mounted
 
 
 @dataclass(frozen=True, eq=False)

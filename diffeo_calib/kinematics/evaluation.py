@@ -28,8 +28,7 @@ from diffeo_calib.sensors.coordinates import Beside, check_shown, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.mounted import mounted_of
-from diffeo_calib.sensors.places import SESSION, Places, sensor_key
+from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -122,8 +121,9 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
     unplaced = model is not None and model.own_frame
     points = partial(_predicted, kinematics)
-    known = devices_of(kinematics), session_frames(kinematics), None if model is None else mounted_of(model)
-    beside = Beside(points, *known, unplaced=unplaced, every_session=every_session)
+    turns = None if model is None else model.turns
+    known = {"unplaced": unplaced, "every_session": every_session}
+    beside = Beside(points, devices_of(kinematics), kinematics, turns, **known)
     parts = rows_of_one_kind(data)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
@@ -143,12 +143,6 @@ def devices_of(model: object) -> dict[str, Devices]:
         if isinstance(own, Devices):
             found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
     return found
-
-
-def session_frames(model: object) -> dict[str, Tensor]:
-    """Name of every set-up of positions that a model knows -> (4, 4) transform from its own frame to that one, m."""
-    sets = [own for own in getattr(model, "placement", None) or () if getattr(own, "kind", None) == SESSION]
-    return {name: T.view(4, 4) for own in sets for name, T in zip(own.names, own.constants, strict=True)}
 
 
 def placement_sentences(model: object) -> list[str]:

@@ -23,8 +23,7 @@ from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import frame_slopes, skew
-from diffeo_calib.sensors.mounted import own_slopes
-from diffeo_calib.sensors.places import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS
+from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, own_slopes
 
 RIGID_MOTION_SHARE = 0.01
 """Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""

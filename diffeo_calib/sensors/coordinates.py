@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -28,20 +28,8 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.mounted import Mounted, Turns, mounted_kind
-from diffeo_calib.sensors.places import (
-    BALL_IS_THE_MARKER,
-    ROWS,
-    SESSION,
-    SOCKET,
-    PlacedDevices,
-    Places,
-    SessionPlaces,
-    check_same_markers,
-    place_sessions,
-    placed,
-    sensor_key,
-)
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, SOCKET, PlacedDevices, Places, placed, sensor_key
+from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates
 
 KNOWN_DEVIATION = 1e-8
@@ -60,17 +48,15 @@ class Beside:
     Args:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
         devices: those of readings whose places are known, by kind.
-        frames: name of a set-up of positions -> (4, 4) transform from the frame of the kinematics to its own, m.
-        mounted: what is on the tool in set-ups that the kinematics know, or in none, for rows that were mounted anew;
-            None for kinematics that do not tell how their tips turn.
+        model: that knows where set-ups are. turns: of its tips; None for kinematics that do not tell.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
     """
 
     points: Callable[[Any], Tensor]
     devices: Mapping[str, Devices]
-    frames: Mapping[str, Tensor] = field(default_factory=dict)
-    mounted: Mounted | None = None
+    model: object = None
+    turns: Turns | None = None
     unplaced: bool = False
     every_session: bool = False
 
@@ -108,14 +94,14 @@ class Sensor(ABC):
     def set_up(self, data: Any, known: Callable[[Measurements], Measurements]) -> Measurements | None:
         """The rows of one set-up whose device says where the robot stands; None where none does.
 
-        ``known``: rows whose tool a model knows as those of the model's, see :meth:`Mounted.in_any_frame`.
+        ``known``: rows whose tool a model knows as those of the model's, see :meth:`SetUps.in_any_frame`.
         """
 
     @abstractmethod
     def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them.
 
-        ``turns`` of the tips that carry the points: see :class:`Mounted`.
+        ``turns`` of the tips that carry the points: see :class:`SetUps`.
         """
 
 
@@ -141,38 +127,19 @@ class Positions(Sensor):
 
         The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
         """
-        if data.remounted:
-            return self._mounted(data, beside, {name for name in data.device_names if name})
-        if beside.unplaced:
+        known = set_up_kind(data).of_model(beside.model, beside.turns)
+        if beside.unplaced and not data.remounted:
             data = data.with_sessions([name or ROWS for name in data.device_names])
-        names = {name: name in beside.frames for name in data.device_names if name}
-        known, new = ([name for name in names if names[name] == held] for held in (True, False))
-        frames = SessionPlaces(tuple(known), torch.stack([beside.frames[name] for name in known])) if known else None
-        if new and (len(names) > 1 or beside.every_session or beside.frames or beside.unplaced):
-            found = self._placed(of_devices(data, new), beside)
-            frames = found if frames is None else frames.beside(found)
-        if frames is None:
+        names = dict.fromkeys(name for name in data.device_names if name)
+        frames, new = known.only(names), [name for name in names if name not in known.names]
+        sought = data.remounted or len(names) > 1 or beside.every_session or beside.unplaced
+        if new and (sought or known.names):
+            rows = of_devices(data, new)
+            frames = frames.beside(type(known).of(beside.points(rows), rows, beside.turns))
+        if not frames.names:
             return Places()
-        found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.sentences()
+        found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.found_sentences()
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
-
-    @staticmethod
-    def _placed(data: Measurements, beside: Beside) -> SessionPlaces:
-        """The frames of all set-ups of some rows, found from them."""
-        found = place_sessions(beside.points(data), data)
-        return replace(found, new=found.names)
-
-    def _mounted(self, data: Measurements, beside: Beside, names: set[str]) -> Places:
-        """The markers of set-ups between which they were mounted anew: those that are known, the others anew."""
-        known = beside.mounted
-        if known is None:
-            what = "rows whose markers were mounted anew"
-            raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
-        if not names <= set(known.names):
-            new = of_devices(data, names - set(known.names))
-            found = mounted_kind(new).of(beside.points(new), new, known.turns)
-            known = known.beside(found) if known.names else found
-        return Places(known, found=tuple(known.sentences()), numbers=known.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Distances, and angles of poses."""
@@ -196,12 +163,8 @@ class Positions(Sensor):
         if len(names) < 2:
             kept = not names or (data.remounted and data.lever is not None)  # a camera that the model knows stays
             return () if kept else (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),)
-        if data.remounted:
-            own = mounted_kind(data).of(points, data, turns)
-            return (PlacedDevices.outside(own.kind, own.names, own.constants, own.deviations),)
-        found = place_sessions(points, data)
-        transforms = found.transforms.flatten(1)
-        return (PlacedDevices.outside(SESSION, found.names, transforms, transforms[:, :0]),)
+        own = set_up_kind(data).of(points, data, turns)
+        return (PlacedDevices.outside(own.kind, own.names, own.constants, own.deviations),)
 
 
 class Poses(Positions):

@@ -15,124 +15,17 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, camera_sentences
 from diffeo_calib.sensors.devices import Devices, check_devices, numbers_text
 from diffeo_calib.sensors.kinds import kind_of, known_kinds
-from diffeo_calib.sensors.mounted import (
-    GROSS_DISTANCES,
-    MOUNTED_FRAME,
-    MOUNTING,
-    carried_frames,
-    mounted_frame_sentences,
-    mounted_sentences,
-    sessions_of,
-)
+from diffeo_calib.sensors.set_ups import KINDS, MOUNTING, SESSION, SetUps
 
-NUMBERS_OF_A_FRAME = 6
-ROUNDS = 3
-
-ROWS = "these rows"
-"""Name of the set-up of rows that name none."""
 BALL_IS_THE_MARKER = (
     "the model was calibrated without a measuring device: the frame of these positions was found from them, 6 numbers, "
     "as if the marker were the ball; if it is another one, register the model first (`model.registered`, evaluate "
     "--register)"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class SessionPlaces:
-    """Where the measuring frames of some sessions are.
-
-    Args:
-        names: S sessions. transforms: (S, 4, 4) from the model's measuring frame to theirs, m.
-        new: names of the sessions whose frames were found from the rows that are judged.
-    """
-
-    names: tuple[str, ...]
-    transforms: Tensor
-    new: tuple[str, ...] = ()
-
-    def aligned(self, data: Measurements) -> Measurements:
-        """Rows of these sessions in the frame of the model, which is also that of rows that name no session."""
-        here = torch.eye(4, dtype=self.transforms.dtype, device=HOST)[None]
-        T = torch.cat([torch.linalg.inv(self.transforms), here])
-        numbers = {"": self.names.index(ROWS) if ROWS in self.names else len(self.names)}
-        numbers |= {name: number for number, name in enumerate(self.names)}
-        return data.in_frames(T[[numbers[name] for name in data.device_names]].to(data.points.device))
-
-    def beside(self, other: SessionPlaces) -> SessionPlaces:
-        """These, and others of other names."""
-        names, transforms = (*self.names, *other.names), torch.cat([self.transforms, other.transforms])
-        return SessionPlaces(names, transforms, (*self.new, *other.new))
-
-    @property
-    def fitted_numbers(self) -> int:
-        """How many numbers were found from the rows that are judged."""
-        return NUMBERS_OF_A_FRAME * len(self.new)
-
-    def entry(self) -> dict[str, object]:
-        """Transforms by name, for programs."""
-        return dict(zip(self.names, self.transforms.tolist(), strict=True))
-
-    def sentences(self) -> list[str]:
-        """What was fitted, and how far every such session's frame is from that of the model."""
-        if not self.new:
-            return []
-        one = len(self.new) == 1
-        whose = "the frame of the one session" if one else f"the frames of {len(self.new)} sessions"
-        lines = [f"{whose} {'was' if one else 'were'} found from these rows, {self.fitted_numbers} numbers in all:"]
-        lines[0] += " with few rows the errors look smaller than they are"
-        for name in self.new:
-            T = self.transforms[self.names.index(name)]
-            turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
-            away = f"{1e3 * float(T[:3, 3].norm()):.4g} mm and {1e3 * turn:.4g} mrad away"
-            lines.append(f"session '{name}': its frame is {away} from that of the model")
-        return lines
-
-
-def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
-    """Place every session of some measurements where its rows fit a model best; its markers stay.
-
-    Args:
-        predicted: (N, P, 3) markers in the frame of the model, m, perhaps with a ball as one more.
-        data: N rows with sessions.
-
-    Raises:
-        MeasurementError: no sessions, or fewer than 4 rows in one.
-    """
-    names, own = sessions_of(data)
-    predicted = predicted[:, : data.markers]
-    check_same_markers(predicted, data.points)
-    rows = [(own == place).to(predicted.device) for place in range(len(names))]
-    found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
-    return SessionPlaces(names, torch.stack(found))
-
-
-def check_same_markers(points: Tensor, measured: Tensor) -> None:
-    """Raise InputError for points (N, P, 3) of other markers than those that were measured."""
-    if points.shape != measured.shape:
-        raise InputError.of(
-            "the model and the measurements do not have the same markers",
-            expected=f"predictions of shape {tuple(measured.shape)}",
-            got=tuple(points.shape),
-            fix="evaluate on the markers that the model was calibrated with, in the same order",
-        )
-
-
-def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
-    """The rigid transform (4, 4) from seen to measured points (N, P, 3) by the rows that are no gross outliers, m."""
-    inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
-    T = torch.eye(4, dtype=seen.dtype, device=seen.device)
-    for _ in range(ROUNDS):
-        T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
-        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
-        inside = away <= GROSS_DISTANCES * away.nanmedian()
-    return T
 
 
 @dataclass(frozen=True)
@@ -202,14 +95,11 @@ def placed(data: Readings, points: Tensor) -> Devices:
     return found
 
 
-SESSION, SOCKET, DRIFT = "session", "socket", "drift"
+SOCKET, DRIFT = "socket", "drift"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, (D, 3) places, m, markers
 that were mounted anew, (D, 3 P) shifts from the model's in the frames of their tips, m, frames on the tool, (D, 16)
 transforms from theirs to that of the model's tool, and columns with which something drifts, see `KnownDrift`."""
-WITHOUT_READINGS = SESSION, SOCKET, DRIFT, MOUNTING, MOUNTED_FRAME, CAMERA
-SET_UPS = SESSION, MOUNTING, MOUNTED_FRAME
-TRANSFORMS = SESSION, MOUNTED_FRAME
-"""Kinds whose constants are transforms, the unit one for the model's own set-up."""
+WITHOUT_READINGS = *KINDS, SOCKET, DRIFT, CAMERA
 MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
@@ -274,16 +164,19 @@ class PlacedDevices:
     @property
     def of_model(self) -> bool:
         """Whether this is one set-up alone, whose frame and markers are those of the model."""
-        return self.kind in SET_UPS and len(self.names) == 1
+        return self.kind in KINDS and len(self.names) == 1
+
+    @property
+    def set_ups(self) -> SetUps | None:
+        """As set-ups; None for other kinds."""
+        return KINDS[self.kind](self.names, self.constants, self.deviations) if self.kind in KINDS else None
 
     @property
     def rows_elsewhere(self) -> Tensor:
         """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
-        if self.kind not in SET_UPS:
+        if self.set_ups is None:
             return self.rows[:0]
-        eye = torch.eye(4, dtype=self.constants.dtype, device=self.constants.device).flatten()
-        away = self.constants - (eye if self.kind in TRANSFORMS else 0.0)
-        return self.rows[(away != 0).any(1)[self.device.to(away.device)].to(self.rows.device)]
+        return self.rows[self.set_ups.elsewhere[self.device.to(self.constants.device)].to(self.rows.device)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> PlacedDevices:
         """The same devices beside another model: those of readings read of its points what they read before.
@@ -293,15 +186,10 @@ class PlacedDevices:
             before, after: (N, P, 3) points of the old and the new model at the rows of the fit, m.
             markers: (P, 3) old places of the markers from the new ones, in the frames of their tips, m.
         """
-        if self.kind == SESSION:
-            moved = self.constants.view(-1, 4, 4) @ torch.linalg.inv(T)
-            return replace(self, constants=moved.flatten(1))
-        if self.kind == MOUNTED_FRAME:
-            return replace(self, constants=carried_frames(self.constants, T, before, after))
+        if self.set_ups is not None:
+            return replace(self, constants=self.set_ups.carried(T, before, after, markers))
         if self.kind == SOCKET:
             return replace(self, constants=self.constants @ T[:3, :3].mT + T[:3, 3])
-        if self.kind == MOUNTING:
-            return replace(self, constants=self.constants + markers.flatten()[: self.constants.shape[1]])
         if self.unknown:
             fix = "import the module that registers it"
             raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
@@ -344,16 +232,11 @@ class PlacedDevices:
             return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
         if self.kind == DRIFT:  # which names the robot's joints
             return []
-        if self.kind == MOUNTING:
-            return mounted_sentences(self.names, self.constants, self.deviations)
-        if self.kind == MOUNTED_FRAME:
-            return mounted_frame_sentences(self.names, self.constants, self.deviations)
-        places = (
-            self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
-        )  # of transforms, row by row
+        if self.set_ups is not None:
+            return self.set_ups.sentences()
         return [
             f"{self.kind} '{name}': {numbers_text((1e3 * place).tolist())} mm in {MODEL_FRAME}"
-            for name, place in zip(self.names, places, strict=True)
+            for name, place in zip(self.names, self.constants[:, :3], strict=True)
         ]
 
     @property

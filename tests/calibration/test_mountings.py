@@ -45,7 +45,7 @@ def test_as_accurate_as_in_one_session(result: dc.CalibrationResult) -> None:
 
 
 def test_the_shifts_are_found(result: dc.CalibrationResult) -> None:
-    found = result.sessions.mounted
+    found = result.sessions.set_ups
     order = ["abc".index(name) for name in found.names]
     away = (found.constants - SHIFTS[order]).abs()
     assert bool((away < 5 * found.deviations + 1e-9).all())

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 from command_bank import Command
 from kind_bank import Kind, kind_named
 from torch.testing import assert_close
@@ -16,7 +15,7 @@ from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cli.commands.correct import _reason
 from diffeo_calib.cli.options import Angle, Length, Rows, Units
 from diffeo_calib.cli.tables import rows_in_table
-from diffeo_calib.kinematics.evaluation import session_frames
+from diffeo_calib.sensors.set_ups import MeasuringFrames
 
 UNITS = Units(length=Length.mm, angle=Angle.deg)
 
@@ -29,10 +28,10 @@ def of_session(kind: Kind, name: str) -> Any:
 def test_rows_of_one_session_are_judged_in_its_frame() -> None:
     """Nothing is found from the rows: the model knows where the device stood; of a new session 6 numbers are."""
     kind = kind_named("sessions")
-    frames = session_frames(kind.model)
-    assert len(frames) == 2
-    assert max(float((T - torch.eye(4, dtype=T.dtype)).abs().max()) for T in frames.values()) > 1e-3
-    for name in frames:
+    frames = MeasuringFrames.of_model(kind.model, None)
+    assert len(frames.names) == 2
+    assert float((frames.constants - frames.same).abs().max()) > 1e-3
+    for name in frames.names:
         rows = of_session(kind, name)
         found = dc.evaluate(kind.model, rows)
         assert found.numbers == 0

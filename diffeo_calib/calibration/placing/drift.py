@@ -83,11 +83,10 @@ class Drift(DeviceSet):
     def settled(self, found: Settled) -> Drift:
         """See :class:`DeviceSet`."""
         own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.joints))
-        centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
         shifts, deviations = (
             own * each.view(len(self.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
         )
-        return replace(self, centre=centre, size_by_column=shifts, deviations=deviations)
+        return replace(self, centre=found.centre, size_by_column=shifts, deviations=deviations)
 
     def with_rows(self, other: OtherRows) -> Drift:
         """See :class:`DeviceSet`: rows that do not tell the columns are those of the middle."""

@@ -21,8 +21,8 @@ from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
-from diffeo_calib.sensors.mounted import View
 from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import View
 
 T = TypeVar("T")
 

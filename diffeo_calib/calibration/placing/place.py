@@ -23,7 +23,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, seen_rows
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled, seen_rows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -209,9 +209,13 @@ class Placed:
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
 
-        Arguments as of :meth:`Placement.settled`.
+        Args:
+            fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
         """
-        placement = self.placement.settled(fitted, fitted_map, chosen)
+        centre = chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
+        here = torch.eye(4, dtype=centre.dtype, device=centre.device)
+        found = Settled(fitted.shifts, Tensor, slice(0), fitted_map, centre, here, chosen)
+        placement = self.placement.settled(fitted, found)
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)

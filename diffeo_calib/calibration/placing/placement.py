@@ -25,8 +25,8 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
-from diffeo_calib.sensors.mounted import Mounted, View
 from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
@@ -84,40 +84,23 @@ class Settled(NamedTuple):
     """Result of a fit for the shifts of one set of devices.
 
     Args:
-        shifts: (c,) their posterior mean.
-        joint: computes the covariance of the shifts of all sets. place: of this set among them.
+        shifts: (c,) their posterior mean. joint: computes the covariance of the shifts of all sets. place: of this set
+            among them.
         fitted: the map, its covariances without rigid motions if no device holds the frame.
-        chosen: scales, and the rows with their weights.
+        centre: (3,) the middle of the rows, m, in the frame of the devices, from which transform (4, 4) leads to that
+            of the model.
+        chosen: scales, and the rows with their weights; None of a recalibration.
+        known: what the old model knew of the tool in each set-up; None of a calibration.
     """
 
     shifts: Tensor
     joint: Callable[[], Tensor]
     place: slice
     fitted: FittedMap
-    chosen: ChosenScales
-
-    @property
-    def covariance(self) -> Tensor:
-        """(c, c) of the shifts."""
-        return self.joint()[self.place, self.place]
-
-
-class SettledAgain(NamedTuple):
-    """Result of a recalibration for the shifts of one set of devices, around the old model.
-
-    Args:
-        shifts: (c,) their posterior mean. joint, place: as of :class:`Settled`. first: number of the first new row.
-        centre: (3,) the middle of the rows in the old frame, m. transform: (4, 4) from there to the new one, m.
-        known: what the old model knew of the tool in each set-up.
-    """
-
-    shifts: Tensor
-    joint: Callable[[], Tensor]
-    place: slice
-    first: int
     centre: Tensor
     transform: Tensor
-    known: Mounted
+    chosen: ChosenScales | None = None
+    known: SetUps | None = None
 
     @property
     def covariance(self) -> Tensor:
@@ -160,10 +143,6 @@ class DeviceSet(ABC):
     @abstractmethod
     def placed(self) -> PlacedDevices | None:
         """Their entries for the model file; None for nothing."""
-
-    def placed_again(self, found: SettledAgain) -> PlacedDevices | None:
-        """Entries for the file of a recalibrated model; None where devices are placed around it."""
-        return None
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -277,37 +256,22 @@ class Placement:
         effects = [own.effects(data) for own in self.sets]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placement:
-        """The devices where a fit puts them.
-
-        Args:
-            fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
-        """
-        if not self.sets:
-            return self
-        shifts, joint = fitted.shifts, cache(lambda: _covariance(fitted_map, fitted.model.noise))
-        found, start = [], 0
+    def settled(self, fitted: Fit, found: Settled, kind: type[DeviceSet] = DeviceSet) -> Placement:
+        """Those of a kind where a fit puts them, whose last shifts are those of all devices."""
+        joint, sets = cache(lambda: _covariance(found.fitted, fitted.model.noise)), list[DeviceSet]()
+        start = len(fitted.shifts) - sum(own.size for own in self.sets)
         for own in self.sets:
             part = slice(start, start + own.size)
-            found.append(own.settled(Settled(shifts[part], joint, part, fitted_map, chosen)))
+            there = found._replace(shifts=fitted.shifts[part], joint=joint, place=part)
+            sets += [own.settled(there)] if isinstance(own, kind) else []
             start += own.size
-        return Placement(tuple(found))
+        return Placement(tuple(sets))
 
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self.sets:
             data = own.aligned(data)
         return data
-
-    def placed_again(self, fitted: Fit, known: SettledAgain) -> list[PlacedDevices]:
-        """Entries of the sets that a recalibration settles, whose shifts are the last ones of its fit."""
-        joint, found = cache(lambda: _covariance(fitted.model, fitted.model.noise)), []
-        start = len(fitted.shifts) - sum(own.size for own in self.sets)
-        for own in self.sets:
-            part = slice(start, start + own.size)
-            found.append(own.placed_again(known._replace(shifts=fitted.shifts[part], joint=joint, place=part)))
-            start += own.size
-        return [own for own in found if own is not None]
 
     def sentences(self) -> list[str]:
         """Where all devices are."""

@@ -50,8 +50,8 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.mounted import View
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
+from diffeo_calib.sensors.set_ups import View
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -249,7 +249,7 @@ class SocketDevices(DeviceSet):
             self,
             places=replace(self.places, positions=positions),
             covariance=root @ found.covariance @ root.mT,
-            left_out=self._left_out(found.chosen),
+            left_out=() if found.chosen is None else self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
         )
 

@@ -21,7 +21,8 @@ from diffeo_calib.kinematics.hand_eye import SetUp
 from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
 from diffeo_calib.measurements.poses import mark_jacobian, poses_from_marks
 from diffeo_calib.sensors.board_camera import BoardCamera
-from diffeo_calib.sensors.places import TRANSFORMS, PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import TRANSFORMS
 
 SMALLEST_REST_M = 1e-6
 

@@ -36,7 +36,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, sensor_of
-from diffeo_calib.sensors.mounted import mounted_of
+from diffeo_calib.sensors.set_ups import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,

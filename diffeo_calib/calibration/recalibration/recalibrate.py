@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import parts
-from diffeo_calib.calibration.placing.placement import Placement, SettledAgain
+from diffeo_calib.calibration.placing.placement import Placement, Settled
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
@@ -50,8 +51,8 @@ from diffeo_calib.kinematics.re_registration.registered_map import Registration,
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import mounted_of
 
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
@@ -235,8 +236,10 @@ def _with_settled(
 ) -> tuple[PlacedDevices, ...]:
     """The devices, set-ups where the fit puts them."""
     first = len(fitted.problem.y) - len(rows)
-    around = SettledAgain(fitted.shifts, Tensor, slice(0), first, rows.centre, place.transform, mounted_of(model))
-    settled = {own.kind: own for own in rows.placement.placed_again(fitted, around)}
+    at = fitted.model, rows.centre, place.transform
+    found = Settled(fitted.shifts, Tensor, slice(0), *at, known=mounted_of(model))
+    each = [own.placed() for own in rows.placement.settled(fitted, found, Sessions) if isinstance(own, Sessions)]
+    settled = {own.kind: replace(own, rows=own.rows + first) for own in each}
     return tuple(settled[own.kind].beside(own) if own.kind in settled else own for own in placement)
 
 

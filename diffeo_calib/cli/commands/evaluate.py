@@ -47,7 +47,8 @@ from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
-from diffeo_calib.sensors.places import Places, SessionPlaces
+from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.set_ups import MeasuringFrames
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""
@@ -138,7 +139,7 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
 
 def _say_places(places: Places) -> None:
     """Print and record what was found from the rows."""
-    if isinstance(places.frames, SessionPlaces):
+    if isinstance(places.frames, MeasuringFrames):
         record.add(session_transforms=places.frames.entry())
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})

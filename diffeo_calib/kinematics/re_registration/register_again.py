@@ -41,8 +41,8 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
-from diffeo_calib.sensors.mounted import mounted_of
 from diffeo_calib.sensors.places import DRIFT, PlacedDevices
+from diffeo_calib.sensors.set_ups import mounted_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)

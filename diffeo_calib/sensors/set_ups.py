@@ -1,0 +1,459 @@
+"""Set-ups between which the device was moved, or what is on the tool: measuring frames, markers, several cameras.
+
+A model holds the measuring frame and the tool of one set-up. With the pose K of the tip and its markers p, or the frame
+X on the tool, the rows of another set-up show T K p (the device was moved), K (p + d) (markers were mounted anew), or
+K X M (several cameras on the tool).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.quantiles import largest_known
+from diffeo_calib.measurements.pose_frames import frames_of_points
+from diffeo_calib.measurements.poses import poses_from_marks, poses_of_triangles
+from diffeo_calib.measurements.rare_names import rare_names
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.placement import PLACES, rigid_fit
+from diffeo_calib.robots.se3 import (
+    frame_slopes,
+    nearest_rotations,
+    skew,
+    transforms,
+    twist_transform,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+FEWEST_ROWS = 4
+"""Rows of a session from which its frame, or what is on the tool, is found."""
+GROSS_DISTANCES = 10.0
+"""Rows that are farther than this many median distances take no part."""
+ROUNDS = 3
+SESSION, MOUNTING, MOUNTED_FRAME = "session", "mounting", "mounted frame"
+"""Kinds of what a model keeps of them."""
+NUMBERS_OF_A_FRAME = 6
+ROWS = "these rows"
+"""Name of the set-up of rows that name none."""
+View = Callable[[Tensor], Tensor]
+"""Poses (M, 4, 4) of a model's tool in its measuring frame -> those that a set-up measures, m."""
+Turns = Callable[[Tensor], Tensor]
+"""Joint values (N, n) -> (N, P', 3, 3) turns of the tips that carry a model's points, P' >= the markers P."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetUps(ABC):
+    """What differs between some set-ups and that of a model.
+
+    Args:
+        names: S set-ups. constants: (S, c). deviations: (S, k) of increments of these, m and rad.
+        turns: of the tips; None for kinematics that do not tell.
+        new: names of the set-ups that were found from the rows that are judged.
+        increments_each: numbers of a set-up that a fit leaves open.
+    """
+
+    kind: ClassVar[str]
+    shape: ClassVar[tuple[int, int]] = (4, 4)
+    """Of the constants of one."""
+    key: ClassVar[str] = "mountings"
+    """Of their entry in results of the command line."""
+    what: ClassVar[str]
+    unit: ClassVar[float] = PLACES.session_m_rad
+    """Prior deviation of an increment in a fit, m or rad."""
+    names: tuple[str, ...]
+    constants: Tensor
+    deviations: Tensor
+    turns: Turns | None = None
+    new: tuple[str, ...] = ()
+    increments_each: int = 0
+
+    @classmethod
+    @abstractmethod
+    def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> Self:
+        """The set-ups of some rows where these fit points (N, P, 3) of the model best, m.
+
+        Raises:
+            MeasurementError: no sessions, or fewer than 4 rows in one.
+        """
+
+    @classmethod
+    def of_model(cls, model: object, turns: Turns | None) -> Self:
+        """Those of this kind that a model knows."""
+        sets = [own for own in getattr(model, "placement", None) or () if getattr(own, "kind", None) == cls.kind]
+        none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
+        constants, std = (torch.cat([getattr(own, k) for own in sets] or [none]) for k in ("constants", "deviations"))
+        return cls(tuple(name for own in sets for name in own.names), constants, std, turns)
+
+    @abstractmethod
+    def aligned(self, data: Measurements) -> Measurements:
+        """Rows of these set-ups as those of the model's; so are rows that name no set-up."""
+
+    @abstractmethod
+    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+        """What increments with their prior deviations do to R numbers of N rows: (N, R, k).
+
+        Args:
+            points: (N, P, 3) of the model's tool, m. slopes: (N, R, 3 P) of the numbers by these; None for coordinates.
+            by_tool: (N, R, 3 P) the same by the points' places on the tool. centre: (3,) about which frames turn, m.
+        """
+
+    @abstractmethod
+    def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
+        """Constants (T, c) after increments (T, k), m and rad, as of :meth:`moved`."""
+
+    @abstractmethod
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        """Constants beside another model of the same robot; arguments as of :meth:`PlacedDevices.carried`."""
+
+    @abstractmethod
+    def sentence(self, number: int) -> str:
+        """What is known of a set-up."""
+
+    def in_any_frame(self, data: Measurements) -> Measurements:
+        """Rows of known set-ups as those of the model's tool, under their names, wherever the device stands now."""
+        return data
+
+    def after(self, known: SetUps) -> Self:
+        """These, found in rows that :meth:`in_any_frame` of others had changed."""
+        return self
+
+    @property
+    def same(self) -> Tensor:
+        """(c,) constants of the model's own set-up."""
+        return torch.eye(4, dtype=self.constants.dtype, device=self.constants.device).flatten()
+
+    @property
+    def elsewhere(self) -> Tensor:
+        """(S,) boolean: the set-ups but the model's."""
+        return (self.constants != self.same).any(1)
+
+    def views(self) -> list[View]:
+        """How each set-up sees poses of the model; as the model where markers were mounted anew."""
+        return [lambda poses: poses for _ in self.names]
+
+    def moved(self, others: Sequence[int], steps: Tensor, std: Tensor, centre: Tensor, T: Tensor) -> Self:
+        """Some set-ups (T,) after increments (T, k), in prior deviations, and with their deviations.
+
+        Frames turn about a centre (3,), m, in a frame from which T (4, 4) leads to that of the model.
+        """
+        constants, deviations = self.constants.clone(), self.deviations.clone()
+        constants[others] = self.stepped(constants[others], self.unit * steps, centre, T)
+        deviations[others] = self.unit * std
+        return replace(self, constants=constants, deviations=deviations)
+
+    def with_reference(self, reference: int) -> Self:
+        """The same, one of them the model's."""
+        own = torch.arange(len(self.names), device=HOST)[:, None] == reference
+        constants, deviations = torch.where(own, self.same, self.constants), self.deviations.masked_fill(own, 0.0)
+        return replace(self, constants=constants, deviations=deviations, new=())
+
+    def only(self, names: Collection[str]) -> Self:
+        """Those with some names."""
+        kept = [number for number, name in enumerate(self.names) if name in names]
+        own = tuple(self.names[number] for number in kept)
+        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept])
+
+    def beside(self, other: Self) -> Self:
+        """These, and those of other names."""
+        if not self.names:
+            return other
+        values = {k: torch.cat([getattr(self, k), getattr(other, k)]) for k in ("constants", "deviations")}
+        return replace(self, names=(*self.names, *other.names), new=(*self.new, *other.new), **values)
+
+    @property
+    def fitted_numbers(self) -> int:
+        """How many numbers were found from the rows that are judged."""
+        return len(self.new) * (self.deviations.shape[1] or NUMBERS_OF_A_FRAME)
+
+    def sentences(self) -> list[str]:
+        """What is known of every set-up but the model's."""
+        return [self.sentence(number) for number in self.elsewhere.nonzero()[:, 0].tolist()]
+
+    def found_sentences(self) -> list[str]:
+        """What was found from the rows that are judged."""
+        count = len(self.new)
+        what = f"the {self.what} of {'one session' if count == 1 else f'{count} sessions'} were found from these rows"
+        line = f"{what}, {self.fitted_numbers} numbers in all: with few rows the errors look smaller than they are"
+        return [line, *(self.sentence(self.names.index(name)) for name in self.new)] if count else []
+
+    def entry(self) -> dict[str, object]:
+        """Constants by name, for programs."""
+        return dict(zip(self.names, self.constants.unflatten(1, self.shape).tolist(), strict=True))
+
+    def of_rows(self, data: Measurements) -> Tensor:
+        """(N, c) the constants of every row."""
+        known = [*("" if name == ROWS else name for name in self.names), ""]
+        whose = torch.tensor([known.index(name) for name in data.device_names], dtype=torch.int64, device=HOST)
+        return torch.cat([self.constants, self.same[None]])[whose].to(data.points)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuringFrames(SetUps):
+    """Measuring frames: constants are the transforms T (16) from that of the model, of unknown deviations."""
+
+    kind, key, what = SESSION, "sessions", "frames"
+
+    @classmethod
+    def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MeasuringFrames:
+        """See :class:`SetUps`: the markers stay; points may have a ball as one more."""
+        names, own = sessions_of(data)
+        predicted = predicted[:, : data.markers]
+        check_same_markers(predicted, data.points)
+        rows = [(own == place).to(predicted.device) for place in range(len(names))]
+        found = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
+        free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not data.same_tool)
+        return cls(names, found, found[:, :0], turns, names, free)
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """See :class:`SetUps`."""
+        return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
+
+    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+        """See :class:`SetUps`: what is left of the differences between the frames, and markers mounted again."""
+        frame = self.unit * frame_slopes(points, centre)
+        frame = frame if slopes is None else slopes @ frame
+        return torch.cat([frame, PLACES.remounted_m * by_tool], 2)[..., : self.increments_each]
+
+    def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        step = twist_transform(steps[:, :NUMBERS_OF_A_FRAME])
+        step[:, :3, 3] += centre - step[:, :3, :3] @ centre
+        return (constants.unflatten(1, (4, 4)) @ T @ step @ torch.linalg.inv(T)).flatten(1)
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        return (self.constants.unflatten(1, (4, 4)) @ torch.linalg.inv(T)).flatten(1)
+
+    def views(self) -> list[View]:
+        """See :class:`SetUps`."""
+        return [lambda poses, T=T: T @ poses for T in self.constants.unflatten(1, (4, 4))]
+
+    def sentence(self, number: int) -> str:
+        """See :class:`SetUps`."""
+        shift, turn = _size(self.constants[number])
+        away = f"{1e3 * shift:.4g} mm and {1e3 * turn:.4g} mrad away from that of the model"
+        return f"session '{self.names[number]}': its frame is {away}"
+
+
+@dataclass(frozen=True, eq=False)
+class MountedMarkers(SetUps):
+    """Markers: constants are their shifts (3 P) from those of the model, in the frames of their tips, m."""
+
+    kind, shape, what, unit = MOUNTING, (-1, 3), "markers", PLACES.remounted_m
+
+    @classmethod
+    def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MountedMarkers:
+        """See :class:`SetUps`."""
+        names, whose = sessions_of(data)
+        P = min(data.markers, predicted.shape[1])
+        away = _turned(turns, data)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
+        found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
+        shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*found, strict=True))
+        return cls(names, shifts, deviations, turns, names, 3 * data.markers)
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """See :class:`SetUps`."""
+        shifts = self.of_rows(data).unflatten(1, (-1, 3))
+        return data.shifted(-(_turned(self.turns, data)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
+
+    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        return self.unit * by_tool
+
+    def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        return constants + steps
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        return self.constants + markers.flatten()[: self.constants.shape[1]]
+
+    def sentence(self, number: int) -> str:
+        """See :class:`SetUps`."""
+        shift, std = (values[number].view(-1, 3) for values in (self.constants, self.deviations))
+        sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
+        seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
+        known = ", ".join(f"{size:.3f} +- {own:.3f} mm" if shown else "not seen" for (size, own), shown in seen)
+        markers = "markers are" if len(shift) > 1 else "marker is"
+        return f"session '{self.names[number]}': its {markers} {known} away from that of the model"
+
+    @property
+    def same(self) -> Tensor:
+        """See :class:`SetUps`."""
+        return self.constants.new_zeros(self.constants.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class MountedFrames(SetUps):
+    """Measured frames, as of several cameras: constants are the transforms M (16), their increments X exp(e) M."""
+
+    kind, what = MOUNTED_FRAME, "frames on the tool"
+
+    @classmethod
+    def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MountedFrames:
+        """See :class:`SetUps`."""
+        names, whose = sessions_of(data)
+        lever = data.bodies.pose_lever()
+        X = frames_of_points(predicted[:, :3], lever)[:, 0]
+        seen = (data.points - X[:, None, :3, 3]) @ X[:, :3, :3]  # in the frame of the model's tool
+        found = [_middle(seen[whose == number]) for number in range(len(names))]
+        points, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
+        shifts = deviations.square().mean(1).sqrt()
+        M = poses_from_marks(points, lever).flatten(1)
+        return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, names, NUMBERS_OF_A_FRAME)
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """See :class:`SetUps`."""
+        return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))
+
+    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        found = self.unit * own_slopes(points[:, :3])
+        return found if slopes is None else slopes[..., : found.shape[1]] @ found
+
+    def in_any_frame(self, data: Measurements) -> Measurements:
+        """See :class:`SetUps`."""
+        if not data.remounted or not set(data.device_names) <= {*self.names, ""}:
+            return data
+        names = {"session": data.session, "session_names": data.session_names, "remounted": True}
+        return with_attributes(self.aligned(data), **names)
+
+    def after(self, known: SetUps) -> MountedFrames:
+        """See :class:`SetUps`."""
+        if not set(self.names) <= set(known.names):
+            return self
+        own = [known.names.index(name) for name in self.names]
+        M, before = (each.unflatten(1, (4, 4)) for each in (self.constants, known.constants[own]))
+        here = (self.deviations == 0).all(1, keepdim=True)  # the reference is where it was before
+        deviations = torch.where(here, known.deviations[own], self.deviations)
+        return replace(self, constants=(M @ before).flatten(1), deviations=deviations)
+
+    def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        return (twist_transform(steps) @ constants.unflatten(1, (4, 4))).flatten(1)
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        """See :class:`SetUps`."""
+        old, new = (poses_of_triangles(points[:, :3]) for points in (before, after))
+        change = torch.linalg.inv(new) @ T @ old
+        mean = transforms(nearest_rotations(change[:, :3, :3].mean(0)), change[:, :3, 3].mean(0))
+        return (mean @ self.constants.unflatten(1, (4, 4))).flatten(1)
+
+    def views(self) -> list[View]:
+        """See :class:`SetUps`."""
+        return [lambda poses, M=M: poses @ M for M in self.constants.unflatten(1, (4, 4))]
+
+    def sentence(self, number: int) -> str:
+        """See :class:`SetUps`."""
+        shift, turn = _size(self.constants[number])
+        known, degrees = 1e3 * float(self.deviations[number, :3].norm()), turn * 180.0 / torch.pi
+        away = f"{1e3 * shift:.3f} +- {known:.3f} mm and {degrees:.3f} degrees away on the tool from the model's"
+        return f"'{self.names[number]}' is {away}"
+
+
+KINDS: dict[str, type[SetUps]] = {kind.kind: kind for kind in (MeasuringFrames, MountedMarkers, MountedFrames)}
+TRANSFORMS = SESSION, MOUNTED_FRAME
+"""Kinds whose constants are transforms."""
+
+
+def set_up_kind(data: Measurements) -> type[SetUps]:
+    """What differs between the set-ups of rows."""
+    return mounted_kind(data.lever) if data.remounted else MeasuringFrames
+
+
+def mounted_kind(lever: float | None) -> type[SetUps]:
+    """What is mounted on a tool: markers, or frames, whose points are at the distance ``lever``, m."""
+    return MountedMarkers if lever is None else MountedFrames
+
+
+def mounted_of(model: Any) -> SetUps:
+    """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
+    return mounted_kind(model.lever).of_model(model, model.turns)
+
+
+def check_same_markers(points: Tensor, measured: Tensor) -> None:
+    """Raise InputError for points (N, P, 3) of other markers than those that were measured."""
+    if points.shape != measured.shape:
+        raise InputError.of(
+            "the model and the measurements do not have the same markers",
+            expected=f"predictions of shape {tuple(measured.shape)}",
+            got=tuple(points.shape),
+            fix="evaluate on the markers that the model was calibrated with, in the same order",
+        )
+
+
+def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
+    """The rigid transform (4, 4) from seen to measured points (N, P, 3) by the rows that are no gross outliers, m."""
+    inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
+    T = torch.eye(4, dtype=seen.dtype, device=seen.device)
+    for _ in range(ROUNDS):
+        T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
+        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
+        inside = away <= GROSS_DISTANCES * away.nanmedian()
+    return T
+
+
+def own_slopes(points: Tensor) -> Tensor:
+    """Derivatives (N, 9, 6) of the three points (N, 3, 3) of frames by a shift and a turn along their own axes."""
+    R, arms = poses_of_triangles(points)[:, None, :3, :3], points - points.mean(1, keepdim=True)
+    turned = R @ -skew((arms[..., None, :] @ R)[..., 0, :])
+    return torch.cat([R.expand_as(turned), turned], 3).flatten(1, 2)
+
+
+def _turned(turns: Turns | None, data: Measurements) -> Tensor:
+    """(N, P', 3, 3) turns of the tips; InputError for kinematics that do not tell."""
+    if turns is None:
+        what = "rows whose markers were mounted anew"
+        raise InputError.of(what, expected="a calibrated model to compare them with", got="other kinematics")
+    return turns(data.q)
+
+
+def _size(constants: Tensor) -> tuple[float, float]:
+    """Shift, m, and turn, rad, of a transform (16,)."""
+    T = constants.view(4, 4)
+    return float(T[:3, 3].norm()), float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+
+
+def _middle(away: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (P, 3) of points (M, P, 3) but for gross outliers, and its standard deviations; zero of hidden markers."""
+    middle = away.nanmedian(0).values
+    size = (away - middle).norm(dim=2)
+    kept = torch.where((size <= GROSS_DISTANCES * size.nanmedian(0).values)[..., None], away, torch.nan)
+    count = (~kept.isnan()).sum(0).clamp(min=1)
+    mean = kept.nanmean(0).nan_to_num(0.0)
+    return mean, ((kept - mean).square().nanmean(0).sqrt() / count.sqrt()).nan_to_num(PLACES.remounted_m)
+
+
+def seen_mounted(deviations: Tensor) -> Tensor:
+    """(..., P) boolean: markers that rows of their session showed, by the deviations (..., P, 3) of their places, m."""
+    return deviations.amax(-1) < 0.5 * PLACES.remounted_m
+
+
+def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
+    """Names of the sessions of some rows, and (N,) the number of each row's, -1 for none.
+
+    Raises:
+        MeasurementError: no sessions, or fewer than 4 rows in one.
+    """
+    if data.session is None:
+        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+    present = data.session[data.session != NO_SOCKET].unique().tolist()
+    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
+    for place, (number, name) in enumerate(zip(present, names, strict=True)):
+        rows = data.session == number
+        own[rows] = place
+        if int(rows.sum()) < FEWEST_ROWS:
+            fix = "check the name in these rows, measure more rows in it, or leave it out"
+            got = few(rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_ROWS))
+            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
+    return names, own
