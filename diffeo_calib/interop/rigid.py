@@ -20,14 +20,12 @@ from dataclasses import dataclass, replace
 from math import sqrt
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, identify
-from diffeo_calib.calibration.identification.registration import OffsetsAndPlaces, register, with_joint_offsets
+from diffeo_calib.calibration.identification.identification import LIMITS, PRECISE, Identification, Prior, identify
+from diffeo_calib.calibration.identification.registration import fit_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 
@@ -36,8 +34,8 @@ RANGE_ROWS = 200
 GEOMETRIC, PROJECTION = "geometric calibration", "projection of the model"
 FOLDS = 5
 """Of the cross-validation."""
-OFFSET_STD, LOOSE_STD, FREE_STD = 2e-3, 0.5, 10.0
-"""Prior standard deviations of joint offsets, of those that only tell the noise, and of base and markers, rad or m.
+OFFSET_STD, LOOSE_STD = 2e-3, 0.5
+"""Prior standard deviations of joint offsets, and of those that only tell the noise, rad or m.
 
 What offsets and base explain equally well goes to the base. Offsets that hardly matter stay small: of a wrist joint
 near its marker, say, which least squares alone puts off by degrees for micrometres.
@@ -138,7 +136,7 @@ def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     start = _placed(model, Geometry.nominal(model.robot).joint_errors, *points)
     noise = _noise(start, *points)
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
-        offsets = _fit_offsets(start, *points, std, noise)
+        offsets = fit_joint_offsets(start, *points, std, noise, **PRECISE)
         geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, *points)
         noise = _noise(geometry, *points)
     return JointOffsets(offsets, _compared(geometry, "joint offsets", on, {}))
@@ -241,21 +239,3 @@ def _validate(
 def _noise(geometry: Geometry, x: Tensor, y: Tensor) -> float:
     """RMS of one coordinate of what a geometry leaves, m."""
     return max(float(distances(geometry, x, y).square().mean().sqrt()) / sqrt(3), LIMITS.smallest_noise_m)
-
-
-def _fit_offsets(geometry: Geometry, x: Tensor, y: Tensor, std: float, noise: float) -> Tensor:
-    """Offsets (n,) by least squares with a prior, together with base and markers."""
-    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    n, places = geometry.chain.n, OffsetsAndPlaces(geometry, x, y)
-    scale = np.array([std] * n + [FREE_STD] * (places.size - n))
-
-    def residual(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([places.errors(scale * u) / noise, u])
-
-    def slopes(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([places.slopes(scale * u) / noise * scale, np.eye(len(u))])
-
-    with torch_alone():
-        found = least_squares(residual, np.zeros(len(scale)), slopes, xtol=1e-12, ftol=1e-12, gtol=1e-12)  # pyright: ignore[reportArgumentType]
-    return torch.from_numpy(scale * found.x)[:n]

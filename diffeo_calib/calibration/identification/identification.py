@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,13 +20,14 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import marker_places
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import Devices
 
 MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
@@ -54,7 +55,7 @@ class EstimationLimits:
 
 
 LIMITS = EstimationLimits()
-F = TypeVar("F")
+PRECISE = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,12 @@ class Prior:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             positive(value, f"Prior.{name}")
+
+    def root(self, geometry: Geometry, held: Sequence[int] = ()) -> Tensor:
+        """Square root (K, f) of the covariance of the parameters of ``geometry``, of which some are held [m or rad]."""
+        free = torch.ones(geometry.size, dtype=torch.bool, device=geometry.base.device)
+        free[list(held)] = False
+        return self.deviations(geometry).diag()[:, free]
 
     def deviations(self, geometry: Geometry) -> Tensor:
         """Standard deviation of each of the K parameters of ``geometry`` [m or rad]."""
@@ -171,134 +178,232 @@ def identify(
         Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
     q, points = checked_rows(geometry.chain, q, points, geometry.markers)
-    rows = _Rows(geometry, q, points, points.new_zeros(*points.shape, 0) if shared is None else shared, tuple(held))
+    own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
+    rows = Rows(geometry, (own,))
     if noise is not None:
         sigma, used = _given_noise(noise, points), prior or Prior()
-        fit = _solve(rows, sigma, used)
+        fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
+        left = fit.errors
         tails, level = Tails.none(*points.shape[:2], device=points.device), float(sigma.square().mean().sqrt())
     else:
-        fit, used, tails, level = _estimate(rows.sample(), prior)
+        fit, used, tails, level = _estimate(Rows(geometry, (own.sample(),)), prior, held)
+        left = rows.errors(fit.theta, fit.shifts)
         if len(tails.weights) < len(q):
-            tails = reweight(rows.squares(fit.theta, fit.shifts) / level**2, 3)
+            tails = reweight(body_squares(left) / level**2, 3)
     how = "estimated" if noise is None else "given"
-    found = geometry.absorb(fit.theta)
-    rms = float(rows.squares(fit.theta, fit.shifts).nanmean().sqrt())
+    rms = float(body_squares(left).nanmean().sqrt())
     ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
     status = f"{ended}: {in_mm(rms, level, how)}."
+    found = geometry.absorb(fit.theta)
     return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
 
 
-class _Rows(NamedTuple):
-    """The measurements, and the geometry that explains them.
+class MeasuredPoints(NamedTuple):
+    """Measured markers (N, P, 3), m, NaN where hidden, with effects (N, P, 3, c) of shifts that rows share."""
 
-    Args:
-        geometry: the start. q: (N, n). points: (N, P, 3). shared: (N, P, 3, c). held: numbers of fixed parameters.
-    """
-
-    geometry: Geometry
     q: Tensor
     points: Tensor
-    shared: Tensor
-    held: tuple[int, ...]
+    effects: Tensor
 
-    def squares(self, theta: Tensor, shifts: Tensor) -> Tensor:
-        """Squared distances (N, P) from measured to fitted points, m^2."""
-        return (self.geometry.points(self.q, theta) - self.points - self.shared @ shifts).square().sum(-1)
+    @property
+    def freedom(self) -> int:
+        """Number c of shifts of unit variance."""
+        return self.effects.shape[3]
 
-    def sample(self) -> _Rows:
+    def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
+        """Predicted minus measured numbers (N, B, d) of B bodies, m, for points (N, P, 3) and shifts (c,)."""
+        return points - self.points - self.effects @ shifts
+
+    def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
+        """Their derivatives (N, B, d, f + c) by f errors that move points by (N, P, 3, f), then by the shifts."""
+        return torch.cat([by_errors, -self.effects], 3)
+
+    def sample(self) -> MeasuredPoints:
         """Random rows that stand for all of them, if there are many."""
         count = max(1, LIMITS.coordinates // self.points[0].numel())
         if len(self.q) <= count:
             return self
         index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
-        return self._replace(q=self.q[index], points=self.points[index], shared=self.shared[index])
+        return MeasuredPoints(*(own[index] for own in self))
 
 
-def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
+class ReadRows(NamedTuple):
+    """Readings of one kind of the first marker, a ball, and devices around which their places are sought."""
+
+    data: Readings
+    devices: Devices
+
+    @property
+    def q(self) -> Tensor:
+        """See :class:`MeasuredPoints`."""
+        return self.data.q
+
+    @property
+    def freedom(self) -> int:
+        """See :class:`MeasuredPoints`."""
+        return self.devices.freedom
+
+    def moved(self, shifts: Tensor) -> Devices:
+        """The devices after shifts, in units of their deviations."""
+        return self.devices.moved(shifts.view(len(self.devices.names), -1) * self.devices.deviations)
+
+    def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
+        """See :class:`MeasuredPoints`."""
+        return -self.moved(shifts).errors(self.data, points[:, 0])[:, None]
+
+    def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
+        """See :class:`MeasuredPoints`."""
+        devices, ball = self.moved(shifts), points[:, 0]
+        device = devices.numbers(self.data)
+        own = devices.observation(device).slope(ball) @ by_errors[:, 0]
+        return torch.cat([own, devices.shared(ball, device)], 2)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of several kinds, and the geometry that explains them.
+
+    Args:
+        geometry: the start. parts: the rows.
+        poses: (N, P, 4, 4) of the markers' tips at the rows of every part where errors of joints and base stay zero, so
+            that only the markers move; None where they may not.
+    """
+
+    geometry: Geometry
+    parts: tuple[MeasuredPoints | ReadRows, ...]
+    poses: Sequence[Tensor] | None = None
+
+    def points(self, theta: Tensor) -> list[Tensor]:
+        """The markers (N, P, 3) at the rows of every part, m."""
+        if self.poses is None:
+            return [self.geometry.points(own.q, theta) for own in self.parts]
+        tool = self.geometry.tool + theta[self.geometry.slices["tool"]].view(-1, 3)
+        return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.poses]
+
+    def by_errors(self, theta: Tensor, root: Tensor) -> list[Tensor]:
+        """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u; with known poses of the only marker."""
+        if self.poses is None:
+            return [self.geometry.sensitivities(own.q, theta) @ root for own in self.parts]
+        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]] for T in self.poses]
+
+    def split(self, shifts: Tensor) -> tuple[Tensor, ...]:
+        """Shifts of every part."""
+        return shifts.split([own.freedom for own in self.parts])
+
+    def errors(self, theta: Tensor, shifts: Tensor) -> list[Tensor]:
+        """Predicted minus measured numbers of every part, m."""
+        each = zip(self.parts, self.points(theta), self.split(shifts), strict=True)
+        return [own.errors(points, own_shifts) for own, points, own_shifts in each]
+
+    def slopes(self, theta: Tensor, shifts: Tensor, root: Tensor) -> list[Tensor]:
+        """Derivatives of all numbers by the unknowns u (f,), theta = root u, then by all shifts."""
+        sizes, found, f = [own.freedom for own in self.parts], [], root.shape[1]
+        each = zip(self.parts, self.points(theta), self.by_errors(theta, root), self.split(shifts), strict=True)
+        for place, (own, points, by_errors, own_shifts) in enumerate(each):
+            slopes = own.slopes(points, by_errors, own_shifts)
+            around = sum(sizes[:place]), sum(sizes[place + 1 :])
+            found.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
+        return found
+
+
+def body_squares(errors: Sequence[Tensor]) -> Tensor:
+    """Squares (N, B) of errors (N, B, d) of several kinds of rows; NaN where hidden."""
+    return torch.cat([own.square().sum(2) for own in errors])
+
+
+def _estimate(rows: Rows, prior: Prior | None, held: Sequence[int]) -> tuple[Fit, Prior, Tails, float]:
     """Parameters, prior deviations, tails and noise level together."""
-    start = (rows.geometry.points(rows.q) - rows.points).square().sum(-1)
+    zero = rows.geometry.tool.new_zeros(rows.geometry.size)
+    start = body_squares(rows.errors(zero, zero.new_zeros(rows.parts[0].freedom)))
     # The median, so that a few gross outliers do not set the level.
     level = max(sqrt(float(start.nanmedian()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
-    used, fits = prior or Prior(), list[_Fit]()
+    used, fits = prior or Prior(), list[Fit]()
 
-    def solved(sigma: Tensor) -> _Fit:
+    def solved(sigma: Tensor) -> Fit:
         nonlocal used
-        fits.append(_solve(rows, sigma, used, start=fits[-1].theta if fits else None))
-        used = used if prior else _scaled(used, rows, fits[-1])
+        root = used.root(rows.geometry, held)
+        fits.append(solve(rows, sigma, root, start=fits[-1].theta if fits else None, **PRECISE))
+        used = used if prior else _scaled(used, root, rows.geometry, fits[-1])
         return fits[-1]
 
-    fit, tails, level = weighed_fits(solved, (level, reweight(start / level**2, 3)), 3, len(known(rows.points)))
+    fit, tails, level = weighed_fits(solved, (level, reweight(start / level**2, 3)))
     return fit._replace(iterations=sum(each.iterations for each in fits)), used, tails, level
 
 
-def weighed_fits(
-    solved: Callable[[Tensor], F], start: tuple[float, Tails], dim: int | Tensor, numbers: int
-) -> tuple[F, Tails, float]:
+def weighed_fits(solved: Callable[[Tensor], Fit], start: tuple[float, Tails]) -> tuple[Fit, Tails, float]:
     """A fit with the noise level and the degrees of freedom of Student's t that it leaves: expectation maximisation.
 
     Args:
-        solved: least squares for standard deviations (N, B) of the bodies, m, with their ``squares`` and ``leverage``.
-        start: the noise level, m, and tails. dim: numbers of each body. numbers: that were measured.
+        solved: least squares for standard deviations (N, B) of the bodies, m. start: the noise level, m, and tails.
     """
-    fit, (level, tails) = None, start
+    level, tails = start
     for _ in range(LIMITS.rounds):
-        fit: Any = solved(level / tails.weights.sqrt())
+        fit = solved(level / tails.weights.sqrt())
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
-        total = float((tails.weights * fit.squares).nansum())
+        squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
+        total = float((tails.weights * squares).nansum())
         before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), LIMITS.smallest_noise_m)
-        tails = reweight(fit.squares / level**2 + fit.leverage / tails.weights, dim)
+        dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in fit.errors]).long()
+        tails = reweight(squares / level**2 + fit.leverage / tails.weights, dim)
         if abs(level - before) < LIMITS.noise_change * level:
             break
     return fit, tails, level
 
 
-def _scaled(prior: Prior, rows: _Rows, fit: _Fit) -> Prior:
+def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
     """Deviations of the joints' errors that maximise the expected likelihood of the parameters (M step)."""
-    squares, joints = fit.theta.square() + fit.covariance.diagonal(), rows.geometry.slices["joints"]
-    free = torch.ones_like(squares)
-    free[list(rows.held)] = 0.0
-    total, count = ((part * free)[joints].view(-1, 2, 3).sum(dim=(0, 2)) for part in (squares, free))
+    squares, free = fit.theta.square() + fit.covariance.diagonal(), (root > 0).any(1).to(root)
+    parts = ((part * free)[geometry.slices["joints"]] for part in (squares, torch.ones_like(squares)))
+    total, count = (part.view(-1, 2, 3).sum(dim=(0, 2)) for part in parts)
     deviations = (total / count.clamp(min=1.0)).sqrt()
     translation, rotation = deviations.clamp(LIMITS.smallest_prior, LIMITS.largest_prior).tolist()
     return replace(prior, translation=translation, rotation=rotation)
 
 
-class _Fit(NamedTuple):
-    """One least-squares fit: theta (K,), covariance (K, K), squared distances (N, P), m^2, and leverage (N, P)."""
+class Fit(NamedTuple):
+    """One least-squares fit.
+
+    Args:
+        theta: (K,) errors. covariance: (K, K). shifts: of all parts.
+        errors: (N, B, d) of every part, m. leverage: (N, B) of all rows.
+    """
 
     theta: Tensor
     covariance: Tensor
     shifts: Tensor
-    squares: Tensor
+    errors: list[Tensor]
     leverage: Tensor
     iterations: int
     converged: bool
 
 
-def _solve(rows: _Rows, sigma: Tensor, prior: Prior, *, start: Tensor | None = None) -> _Fit:
-    """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
-    geometry, q, points, shared, held = rows
-    hidden = points.isnan().any(2, keepdim=True)
-    weight, points = (1 / sigma[..., None]).masked_fill(hidden, 0.0), points.masked_fill(hidden, 0.0)  # (N, P, 1 and 3)
-    scale = prior.deviations(geometry)  # (K,)
-    scale[list(held)] = 0.0
-    size, shifting = len(scale), (-weight[..., None] * shared).flatten(0, 2)
+def solve(rows: Rows, sigma: Tensor, root: Tensor, *, start: Tensor | None = None, **options: Any) -> Fit:
+    """Fit errors theta = root u, and shifts: the prior is then one row of the identity per unknown without units.
+
+    Args:
+        rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of all rows, m.
+        root: (K, f) square root of the prior covariance of the errors. start: (K,). options: of scipy.
+    """
+    f = root.shape[1]
+    u0 = root.new_zeros(f + sum(own.freedom for own in rows.parts))
+    u0[:f] = 0.0 if start is None else torch.linalg.lstsq(root, start[:, None]).solution[:, 0]
+    hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
+    weights = [1 / own[..., None] for own in sigma.split([len(own) for own in hidden])]
 
     def errors(u: Tensor) -> Tensor:
-        return (weight * (geometry.points(q, scale * u[:size]) - points)).flatten() + shifting @ u[size:]
+        each = zip(weights, rows.errors(root @ u[:f], u[f:]), hidden, strict=True)
+        return torch.cat([(w * own).masked_fill(h, 0.0).flatten() for w, own, h in each])
 
     def slopes(u: Tensor) -> Tensor:
-        by_theta = weight[..., None] * geometry.sensitivities(q, scale * u[:size]) * scale
-        return torch.cat([by_theta.flatten(0, 2), shifting], 1)
+        each = zip(weights, rows.slopes(root @ u[:f], u[f:], root), hidden, strict=True)
+        return torch.cat([(w[..., None] * own).masked_fill(h[..., None], 0.0).flatten(0, 2) for w, own, h in each])
 
-    u0 = scale.new_zeros(size + shared.shape[-1])
-    u0[:size] = 0.0 if start is None else torch.where(scale > 0, start / scale, 0.0)
-    found = least_squares_of(errors, slopes, u0, xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    root = found.root[:size] * scale[:, None]
-    theta, shifts = scale * found.u[:size], found.u[size:]
-    leverage = found.leverage.view(points.shape).sum(-1)
-    squares = rows.squares(theta, shifts)
-    return _Fit(theta, root @ root.mT, shifts, squares, leverage, found.iterations, found.converged)
+    found = least_squares_of(errors, slopes, u0, **options)
+    theta, shifts, known = root @ found.u[:f], found.u[f:], root @ found.root[:f]
+    parts = zip(found.leverage.split([own.numel() for own in hidden]), hidden, strict=True)
+    leverage = torch.cat([own.view(h.shape).sum(2) for own, h in parts])
+    left = rows.errors(theta, shifts)
+    return Fit(theta, known @ known.mT, shifts, left, leverage, found.iterations, found.converged)
 
 
 class Minimum(NamedTuple):

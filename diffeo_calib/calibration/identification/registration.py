@@ -20,23 +20,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from math import sqrt
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
     LIMITS,
     Identification,
+    MeasuredPoints,
     Prior,
+    Rows,
     checked_rows,
     identify,
     in_mm,
+    solve,
 )
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known, largest_known
-from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
@@ -235,8 +237,9 @@ def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int)
     return Identification(geometry, rms, noise, covariance, 0, status, theta, Prior(), tails)
 
 
-OFFSET_STD = 0.5
-"""Prior standard deviation of a joint offset, rad or m; it only chooses among offsets that poses cannot separate."""
+OFFSET_STD, FREE_STD = 0.5, 10.0
+"""Prior standard deviations, rad or m: of a joint offset, which only chooses among offsets that poses cannot separate,
+and of base and markers beside them, no constraint."""
 INLIER_ERROR = 0.1
 """Error of a coordinate, relative to the median distance, beyond which Huber's loss grows linearly."""
 MAX_EVALUATIONS = 100
@@ -253,71 +256,41 @@ def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
     Returns:
         (n,) [rad or m]; zero where base or markers could explain the same change.
     """
-    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    n, places = q.shape[1], OffsetsAndPlaces(geometry, q, points)
-    typical = float((geometry.points(q) - points).norm(dim=-1).nanmedian())
-
-    def residual(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([places.errors(u) / typical, u[:n] / OFFSET_STD])
-
-    def slopes(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([places.slopes(u) / typical, np.eye(n, len(u)) / OFFSET_STD])
-
-    start = np.zeros(places.size)
+    typical = (geometry.points(q) - points).norm(dim=-1).nanmedian()
     # Huber's loss on every coordinate: a few gross outliers have little influence.
     options = {"loss": "huber", "f_scale": INLIER_ERROR, "x_scale": "jac", "max_nfev": MAX_EVALUATIONS}
-    with torch_alone():
-        found = least_squares(residual, start, slopes, **options)  # pyright: ignore[reportArgumentType]
-    return torch.from_numpy(found.x[:n])
+    return fit_joint_offsets(geometry, q, points, OFFSET_STD, typical, **options)
 
 
-class OffsetsAndPlaces:
-    """Errors of points as functions of joint offsets, the base's twist and the markers' shifts.
-
-    The unknowns are the n offsets [rad or m], then the 6 of the base [m, rad], then the 3 P of the markers [m].
+def fit_joint_offsets(
+    geometry: Geometry, q: Tensor, points: Tensor, deviation: float, noise: float | Tensor, **options: Any
+) -> Tensor:
+    """Offsets (n,) by least squares with a prior deviation, rad or m, together with base and markers; scipy's options.
 
     Args:
-        geometry: at zero of all unknowns. q: (N, n). points: (N, P, 3) m; where they are hidden (NaN) errors are zero.
+        geometry: a registered robot. q: (N, n). points: (N, P, 3) m; NaN where hidden. noise: of a coordinate, m.
     """
+    twists, parts = offset_twists(geometry), geometry.slices
+    places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
+    root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
+    rows = Rows(geometry, (MeasuredPoints(q, points, points.new_zeros(*points.shape, 0)),))
+    fit = solve(rows, torch.ones_like(points[..., 0]) * noise, root, **options)
+    return torch.linalg.lstsq(twists, (fit.theta * (twists != 0).any(1))[:, None]).solution[:, 0]
 
-    def __init__(self, geometry: Geometry, q: Tensor, points: Tensor) -> None:
-        self.geometry, self.q, self.points, parts = geometry, q, points, geometry.slices
-        places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
-        self.places = torch.tensor(places, dtype=torch.int64, device=q.device)
 
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.q.shape[1] + len(self.places)
-
-    def errors(self, u: np.ndarray) -> np.ndarray:
-        """Of every coordinate: (3 N P,) m."""
-        return (self.geometry.points(*self._at(u)) - self.points).nan_to_num(0.0).flatten().numpy()
-
-    def slopes(self, u: np.ndarray) -> np.ndarray:
-        """Derivatives of the errors: (3 N P, size)."""
-        at = self._at(u)
-        by_place = self.geometry.sensitivities(*at)[..., self.places]
-        every = torch.cat([self.geometry.jacobian(*at), by_place], -1)
-        return every.masked_fill(self.points.isnan()[..., None], 0.0).flatten(0, 2).numpy()
-
-    def _at(self, u: np.ndarray) -> tuple[Tensor, Tensor]:
-        values, n = torch.from_numpy(u), self.q.shape[1]
-        zero = torch.zeros(self.geometry.size, dtype=self.q.dtype, device=self.q.device)
-        return self.q + values[:n], zero.index_copy(0, self.places, values[n:])
+def offset_twists(geometry: Geometry) -> Tensor:
+    """(K, n) the errors of joints that are offsets of the n joint values, of mimic joints included."""
+    chain = geometry.chain
+    turning, coupling = chain.revolute[:, None], chain.coupling.to(geometry.base)
+    axes = torch.cat([torch.where(turning, 0.0, chain.axes), torch.where(turning, chain.axes, 0.0)], 1)  # (n_all, 6)
+    found = coupling.new_zeros(geometry.size, chain.n)
+    found[geometry.slices["joints"]] = (axes[:, :, None] * coupling[:, None]).flatten(0, 1)
+    return found
 
 
 def with_joint_offsets(geometry: Geometry, offsets: Tensor) -> Geometry:
     """The geometry with other joint offsets (n,): its points at q are those of the given geometry at q + offsets."""
-    chain = geometry.chain
-    amounts = chain.coupling.to(offsets) @ offsets  # of all moving joints, mimic joints included
-    motion = amounts[:, None] * chain.axes
-    turning = chain.revolute[:, None]
-    twists = torch.cat([torch.where(turning, 0.0, motion), torch.where(turning, motion, 0.0)], 1)  # (n_all, 6)
-    theta = torch.zeros(geometry.size, dtype=twists.dtype, device=twists.device)
-    theta[geometry.slices["joints"]] = twists.flatten()
-    return geometry.absorb(theta)
+    return geometry.absorb(offset_twists(geometry) @ offsets)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,15 +18,17 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_siz
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     LIMITS,
+    Fit,
     Identification,
     Prior,
+    ReadRows,
+    Rows,
     held_parameters,
     in_mm,
-    least_squares_of,
+    solve,
     weighed_fits,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
@@ -176,12 +177,11 @@ def identify_readings(
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    scale = _deviations(bare)
-    still = scale.clone()
-    still[bare.slices["joints"]] = 0.0
-    poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
+    held, joints = held_parameters(bare), range(bare.size)[bare.slices["joints"]]
+    root, still = Prior().root(bare, held), Prior().root(bare, [*held, *joints])
+    poses = [bare.marker_poses(data.q) for data in tables]
     for data, T in zip(tables, poses, strict=True):
-        kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
+        kind_of(data).check_unit(data, T[:, 0, :3, :3], T[:, 0, :3, 3])
     found = _rough_fits(bare, tables, still, _starts(bare.tool[0], tables, poses), poses)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
@@ -190,29 +190,36 @@ def identify_readings(
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
-    doubted = [kind_of(data).doubts_unit(data, own) for data, own in zip(tables, rough.errors, strict=True)]
+    each = zip(tables, rough.errors, strict=True)
+    doubted = [kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each]
     if any(doubted) or worst[0] > LARGEST_SHARE * bare.chain.reach:
         _doubt(bare, tables, still, poses, worst)
     rms = _rms(rough.errors)
     start = rows.geometry.absorb(rough.theta)
-    registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(rows.count, 1))
-    rows = rows._replace(geometry=start, poses=poses if rigid else None)
-    return _estimate(rows, rough.devices, still if rigid else scale, registration)
+    count = sum(map(len, tables))
+    registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(count, 1))
+    parts = _parts(tables, _moved(rows, rough.shifts))
+    return _estimate(Rows(start, parts, rows.poses if rigid else None), still if rigid else root, registration)
+
+
+def _parts(tables: Sequence[Readings], devices: Sequence[Devices]) -> tuple[ReadRows, ...]:
+    return tuple(ReadRows(*own) for own in zip(tables, devices, strict=True))
 
 
 def _rough_fits(
     bare: Geometry,
     tables: Sequence[Readings],
-    scale: Tensor,
+    root: Tensor,
     starts: Sequence[tuple[Tensor, list[Devices]]],
     poses: Sequence[Tensor],
-) -> list[tuple[tuple[float, str], _Fit, _Rows]]:
+) -> list[tuple[tuple[float, str], Fit, Rows]]:
     """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
     found = []
     for ball, devices in starts:
-        rows = _Rows(bare.with_tool(ball[None]), tuple(tables), poses)
+        rows = Rows(bare.with_tool(ball[None]), _parts(tables, devices), poses)
+        sigma = ball.new_full((sum(map(len, tables)), 1), ROUGH_M)
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
-            rough = _solve(rows, devices, scale, ball.new_full((rows.count,), ROUGH_M), robust=True)
+            rough = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
             found.append((_of_worst_device(tables, rough.errors), rough, rows))
     return found
 
@@ -270,7 +277,8 @@ def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> Foun
         return None
     devices = [own if free is None else free for own, free in zip(found.registered, freed, strict=True)]
     geometry = found.registration.geometry
-    return _estimate(_Rows(geometry, tuple(tables)), devices, _deviations(geometry), found.registration)
+    root = Prior().root(geometry, held_parameters(geometry))
+    return _estimate(Rows(geometry, _parts(tables, devices)), root, found.registration)
 
 
 def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
@@ -279,7 +287,7 @@ def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) 
     for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
         rows = [data.device == number for number in range(len(data.names))]
         kind = kind_of(data)
-        alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
+        alone = [kind.alone(data.rows(own), T[own, 0, :3, :3], T[own, 0, :3, 3]) for own in rows]
         each = [one for one in alone if one is not None]
         found += [(ball, _around(ball, tables, poses)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
         if len(each) == len(rows):
@@ -292,36 +300,15 @@ def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) 
 
 def _around(ball: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[Devices]:
     """The devices in closed form for a ball (3,) in the tip's frame, m."""
-    points = [(T[:, :3, :3] @ ball[:, None])[..., 0] + T[:, :3, 3] for T in poses]
+    points = [T[:, 0, :3, :3] @ ball + T[:, 0, :3, 3] for T in poses]
     return [kind_of(data).at(data, z) for data, z in zip(tables, points, strict=True)]
 
 
-def _deviations(geometry: Geometry) -> Tensor:
-    """Prior deviations (K,) of the errors, zero for those that readings cannot show."""
-    prior = Prior().deviations(geometry)
-    prior[list(held_parameters(geometry))] = 0.0
-    return prior
-
-
-def _freedoms(tables: Sequence[Readings]) -> int | Tensor:
-    """Numbers of each row."""
-    sizes = [data.values.shape[1] for data in tables]
-    if len(set(sizes)) == 1:
-        return sizes[0]
-    own = [
-        torch.full((len(data), 1), size, dtype=torch.int64, device=HOST)
-        for data, size in zip(tables, sizes, strict=True)
-    ]
-    return torch.cat(own)
-
-
-def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registration: Identification) -> FoundReadings:
+def _estimate(rows: Rows, root: Tensor, registration: Identification) -> FoundReadings:
     """Errors, devices, tails and noise level together."""
-    start = max(registration.rms, LIMITS.smallest_noise_m), Tails.none(rows.count, 1, device=scale.device)
-    numbers = sum(data.values.numel() for data in rows.tables)
-    fit, tails, level = weighed_fits(
-        lambda sigma: _solve(rows, registered, scale, sigma[:, 0]), start, _freedoms(rows.tables), numbers
-    )
+    count = sum(len(own.q) for own in rows.parts)
+    start = max(registration.rms, LIMITS.smallest_noise_m), Tails.none(count, 1, device=root.device)
+    fit, tails, level = weighed_fits(lambda sigma: solve(rows, sigma, root, max_nfev=STARTS_STEPS), start)
     rms = _rms(fit.errors)
     identification = replace(
         registration,
@@ -332,7 +319,8 @@ def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registr
         tails=tails,
         status=f"{in_mm(rms, level, 'estimated')}.",
     )
-    return FoundReadings(registration, identification, tuple(registered), fit.devices)
+    registered = tuple(own.devices for own in rows.parts if isinstance(own, ReadRows))
+    return FoundReadings(registration, identification, registered, _moved(rows, fit.shifts))
 
 
 def _rms(errors: Sequence[Tensor]) -> float:
@@ -340,113 +328,28 @@ def _rms(errors: Sequence[Tensor]) -> float:
     return float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt())
 
 
-class _Rows(NamedTuple):
-    """Readings of several kinds, and the geometry that explains them.
-
-    Args:
-        geometry: with one marker, the ball. tables: readings.
-        poses: (M, 4, 4) of the tip at the rows of every table where errors of joints stay zero, so that only the ball
-            moves; None where they may not.
-    """
-
-    geometry: Geometry
-    tables: tuple[Readings, ...]
-    poses: Sequence[Tensor] | None = None
-
-    @property
-    def count(self) -> int:
-        return sum(map(len, self.tables))
-
-    def _balls(self, theta: Tensor) -> list[Tensor]:
-        """The ball (M, 3) at the rows of every table, m."""
-        if self.poses is None:
-            return [self.geometry.points(data.q, theta)[:, 0] for data in self.tables]
-        ball = self.geometry.tool[0] + theta[self.geometry.slices["tool"]]
-        return [T[:, :3, :3] @ ball + T[:, :3, 3] for T in self.poses]
-
-    def _by_errors(self, theta: Tensor, free: Tensor) -> list[Tensor]:
-        """Derivatives (M, 3, f) of these by some errors."""
-        if self.poses is None:
-            return [self.geometry.sensitivities(data.q, theta)[:, 0][..., free] for data in self.tables]
-        return [T[:, :3, :3] for T in self.poses]
-
-    def errors(self, theta: Tensor, devices: Sequence[Devices]) -> list[Tensor]:
-        """Predicted minus measured readings (M, r) of every table, m."""
-        each = zip(self.tables, devices, self._balls(theta), strict=True)
-        return [-own.errors(data, ball) for data, own, ball in each]
-
-    def slopes(self, theta: Tensor, devices: Sequence[Devices], free: Tensor, scale: Tensor) -> list[Tensor]:
-        """Derivatives (M, r, f + all increments) of these, in units of the prior deviations, by the free errors."""
-        sizes = [own.freedom for own in devices]
-        found, each = [], zip(self.tables, devices, self._balls(theta), self._by_errors(theta, free), strict=True)
-        for place, (data, own, ball, by_errors) in enumerate(each):
-            device = own.numbers(data)
-            by_theta = own.observation(device).slope(ball) @ (by_errors * scale[free])
-            before, after = sum(sizes[:place]), sum(sizes[place + 1 :])
-            shared = torch.nn.functional.pad(own.shared(ball, device), (before, after))
-            found.append(torch.cat([by_theta, shared], 2))
-        return found
-
-
-class _Fit(NamedTuple):
-    """theta (K,), the devices, errors (M, r) of the rows of every table, m, and leverage (N, 1) of all rows."""
-
-    theta: Tensor
-    devices: tuple[Devices, ...]
-    errors: list[Tensor]
-    leverage: Tensor
-
-    @property
-    def squares(self) -> Tensor:
-        """(N, 1) m^2."""
-        return torch.cat([errors.square().sum(1, keepdim=True) for errors in self.errors])
-
-
-def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor, *, robust: bool = False) -> _Fit:
-    """Fit theta = scale u and the devices' increments, in units of their deviations, by least squares."""
-    free, sizes = scale.nonzero()[:, 0], [own.freedom for own in devices]
-    K = len(free)
-    weights = [1.0 / own[:, None] for own in sigma.split([len(data) for data in rows.tables])]
-
-    def moved(u: Tensor) -> tuple[Tensor, tuple[Devices, ...]]:
-        pairs = zip(devices, u[K:].split(sizes), strict=True)
-        theta = torch.zeros_like(scale).index_copy(0, free, scale[free] * u[:K])
-        return theta, tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
-
-    def errors(u: Tensor) -> Tensor:
-        return torch.cat([(w * e).flatten() for w, e in zip(weights, rows.errors(*moved(u)), strict=True)])
-
-    start = scale.new_zeros(K + sum(sizes))
-
-    def slopes(u: Tensor) -> Tensor:
-        pairs = zip(weights, rows.slopes(*moved(u), free, scale), strict=True)
-        return torch.cat([(w[..., None] * s).flatten(0, 1) for w, s in pairs])
-
-    loss = "soft_l1" if robust else "linear"
-    found = least_squares_of(errors, slopes, start, max_nfev=STARTS_STEPS, loss=loss)
-    theta, there = moved(found.u)
-    left = rows.errors(theta, there)
-    parts = zip(found.leverage.split([e.numel() for e in left]), left, strict=True)
-    leverage = torch.cat([own.view(e.shape).sum(1, keepdim=True) for own, e in parts])
-    return _Fit(theta, there, left, leverage)
+def _moved(rows: Rows, shifts: Tensor) -> tuple[Devices, ...]:
+    """The devices of all rows after shifts."""
+    each = zip(rows.parts, rows.split(shifts), strict=True)
+    return tuple(own.moved(some) for own, some in each if isinstance(own, ReadRows))
 
 
 def _of_worst_device(tables: Sequence[Readings], errors: Sequence[Tensor]) -> tuple[float, str]:
     """The largest median residual of a device's readings, m, and its name: one wrong plane of three shows in it."""
     return max(
-        (float(own.norm(dim=1)[data.device == number].median()), name)
+        (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
         for data, own in zip(tables, errors, strict=True)
         for number, name in enumerate(data.names)
     )
 
 
 def _doubt(
-    bare: Geometry, tables: Sequence[Readings], scale: Tensor, poses: Sequence[Tensor], worst: tuple[float, str]
+    bare: Geometry, tables: Sequence[Readings], root: Tensor, poses: Sequence[Tensor], worst: tuple[float, str]
 ) -> None:
     """Raise MeasurementError for readings that fit in mm or m, in place of the other unit; warn if they do not.
 
     Args:
-        bare, tables, scale, poses: see :func:`_rough_fits`. worst: median residual, m, of the device where it is
+        bare, tables, root, poses: see :func:`_rough_fits`. worst: median residual, m, of the device where it is
             largest, and its name.
     """
     (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
@@ -456,7 +359,7 @@ def _doubt(
     }
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(bare, other, scale, _starts(bare.tool[0], other, poses), poses)
+        found = _rough_fits(bare, other, root, _starts(bare.tool[0], other, poses), poses)
         if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
