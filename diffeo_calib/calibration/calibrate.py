@@ -38,7 +38,6 @@ from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.judgement import warn_of_contradictions
 from diffeo_calib.calibration.placing.drift import worth_it
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.of_models import check_models
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -184,7 +183,7 @@ def calibrate(
 def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float | None]:
     """Lengths against the robot's description, and by how much one that is too improbable moves points, m."""
     data = chosen.data
-    found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(seen_rows(data)))
+    found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(data))
     worst = doubtful(found)
     if worst is None:
         return found, None
@@ -195,9 +194,7 @@ def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float 
 def _change(placed: Placed, chosen: ChosenScales) -> str | None:
     """A sentence about what changed during the measurements."""
     numbers, data, placement = placed.data.line_numbers, chosen.data, placed.placement
-    return change_during(
-        numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(seen_rows(data))
-    )
+    return change_during(numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(data))
 
 
 def _warn_of_what_is_open(robot: Tree, placed: Placed, data: TangentData) -> None:

@@ -17,7 +17,6 @@ from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few, variance_ratio
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -329,7 +328,7 @@ class CampaignModel:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        return Around(data.rows(index), lambda: placed.placement.changes(seen_rows(data)), index)
+        return Around(data.rows(index), lambda: placed.placement.changes(data), index)
 
     def _asked(self, table: Any) -> tuple[Rows, Rows]:
         """The target, and the candidates as if they were measured like the row :attr:`like`."""

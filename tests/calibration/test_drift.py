@@ -111,7 +111,7 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
     effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
-    found = replace(drift, centre=centre, size_by_column=size[None], deviations=size[None].abs()).known
+    found = replace(drift.known, centre=centre, sizes=size[None], deviations=size[None].abs())
     back = found.aligned(data)
     assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
     assert back.covariates is None

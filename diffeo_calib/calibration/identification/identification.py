@@ -382,11 +382,11 @@ def solve(rows: Rows, sigma: Tensor, root: Tensor, *, start: Tensor | None = Non
 
     Args:
         rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of all rows, m.
-        root: (K, f) square root of the prior covariance of the errors. start: (K,). options: of scipy.
+        root: (K, f) square root of the prior covariance of the errors, of orthogonal columns. start: (K,). options: of scipy.
     """
     f = root.shape[1]
     u0 = root.new_zeros(f + sum(own.freedom for own in rows.parts))
-    u0[:f] = 0.0 if start is None else torch.linalg.lstsq(root, start[:, None]).solution[:, 0]
+    u0[:f] = 0.0 if start is None else (root.mT @ start) / root.square().sum(0)
     hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
     weights = [1 / own[..., None] for own in sigma.split([len(own) for own in hidden])]
 
@@ -427,17 +427,18 @@ def least_squares_of(
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
     def residual(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([errors(torch.from_numpy(u)).numpy(), u])
+        return np.concatenate([errors(torch.from_numpy(u).clone()).numpy(), u])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([slopes(torch.from_numpy(u)).numpy(), np.eye(len(u))])
+        return np.concatenate([slopes(torch.from_numpy(u).clone()).numpy(), np.eye(len(u))])
 
     derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
         fit = least_squares(residual, u0.numpy(), derivatives, **options)
         U, s, Vt = np.linalg.svd(jacobian(fit.x), full_matrices=False)  # s >= 1 by the prior rows
     leverage = torch.from_numpy(np.square(U[: -len(fit.x)]).sum(1))
-    return Minimum(torch.from_numpy(fit.x), torch.from_numpy(Vt.T / s), leverage, int(fit.nfev), fit.status > 0)
+    u, root = torch.from_numpy(fit.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
+    return Minimum(u, root, leverage, int(fit.nfev), fit.status > 0)
 
 
 def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:

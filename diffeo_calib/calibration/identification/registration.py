@@ -104,8 +104,13 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     kept = s > UNDETERMINED_MOTION_M * sqrt(count)
     rank = int(kept.sum())
     noise = rms * sqrt(count / max(coordinates - rank, 1))
-    covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
-    covariance[sought[:, None], sought] = _covariance(slopes, max(noise, LIMITS.smallest_noise_m) * sqrt(count))
+    # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
+    error = points.new_full(points.shape[:2], max(noise, LIMITS.smallest_noise_m) * sqrt(count))
+    places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
+    prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m)
+    root = prior.root(geometry, range(geometry.size)[parts["joints"]])
+    own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0))
+    covariance = solve(Rows(geometry, (own,)), error, root, max_nfev=1).covariance
     done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
     status = f"{done} after {iterations} steps: {in_mm(rms, noise, 'estimated')}"
     if rank < len(sought):
@@ -121,23 +126,6 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     tails = Tails.none(len(q), geometry.markers, device=q.device)
     theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device)
     return Identification(geometry, rms, noise, covariance, iterations, status + ".", theta, Prior(), tails)
-
-
-def _covariance(slopes: Tensor, error: float) -> Tensor:
-    """Covariance (k, k) of base and markers, within their priors, for errors that are common to all rows.
-
-    The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
-
-    Args:
-        slopes: (3 S, k) derivatives by the twist of the base, then by the markers.
-        error: of a coordinate, times the root of the number of points [m].
-    """
-    markers = (slopes.shape[1] - 6) / 3
-    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * PLACES.marker_m)
-    deviations[:3], deviations[3:6] = PLACES.open_base_m, PLACES.open_base_rad
-    white = slopes * deviations / error
-    eye = torch.eye(len(deviations), dtype=slopes.dtype, device=slopes.device)
-    return deviations[:, None] * torch.linalg.inv(eye + white.mT @ white) * deviations
 
 
 ROUNDS = 30
@@ -275,7 +263,7 @@ def fit_joint_offsets(
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
     rows = Rows(geometry, (MeasuredPoints(q, points, points.new_zeros(*points.shape, 0)),))
     fit = solve(rows, torch.ones_like(points[..., 0]) * noise, root, **options)
-    return torch.linalg.lstsq(twists, (fit.theta * (twists != 0).any(1))[:, None]).solution[:, 0]
+    return (twists.mT @ fit.theta) / twists.square().sum(0)
 
 
 def offset_twists(geometry: Geometry) -> Tensor:

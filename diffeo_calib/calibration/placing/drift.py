@@ -9,15 +9,18 @@ predict rows that are left out better, see :func:`worth_it`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import frame_slopes
-from diffeo_calib.sensors.known_drift import KnownDrift
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.known_drift import OFFSETS, KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
@@ -33,44 +36,32 @@ class Drift(DeviceSet):
     """Drift of N rows with K columns.
 
     Args:
-        names: of the columns. joints: names and whether each turns, n of them.
-        lowest, highest: (K,) range of every column in the rows of the fit. values: (N, K).
-        q: (N, n) configurations.
-        centre: (3,) about which the frame turns and lengths grow, m.
-        size_by_column, deviations: (K, 7 + n) the unknowns and their standard deviations: shift, turn, growth, offsets.
+        known: what was found, or zero before a fit. values: (N, K). q: (N, n) configurations.
+        centre: (3,) about which the frame turns and lengths grow, m; by default the middle of the rows.
     """
 
-    names: tuple[str, ...]
-    joints: tuple[tuple[str, bool], ...]
-    lowest: Tensor
-    highest: Tensor
+    known: KnownDrift
     values: Tensor
     q: Tensor
     centre: Tensor | None = None
-    size_by_column: Tensor | None = None
-    deviations: Tensor | None = None
 
     @classmethod
-    def of_table(cls, data: Any, chain: Any) -> list[DeviceSet]:
+    def of_table(cls, data: Measurements | Readings | Observations, chain: Tree) -> list[DeviceSet]:
         """That of all columns of a table which are not constant; none without any."""
-        if data.covariates is None:
-            return []
-        lowest, highest = data.covariates.amin(0), data.covariates.amax(0)
-        if not bool((highest > lowest).all()):
+        values = data.covariates
+        if values is None or not bool((values.amax(0) > values.amin(0)).all()):
             return []
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
-        return [cls(data.covariate_names, joints, lowest, highest, data.covariates, data.q)]
+        nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
+        ends = values.amin(0), values.amax(0), values.new_zeros(3)
+        return [cls(KnownDrift(data.covariate_names, joints, *ends, nothing, nothing), values, data.q)]
 
     @property
     def size(self) -> int:
         """Shift, turn, growth and joint offsets for each column."""
-        return len(self.names) * (7 + len(self.joints))
+        return self.known.sizes.numel()
 
-    def ramp(self, values: Tensor) -> Tensor:
-        """From -1/2 to 1/2 over the range of each column: (N, K)."""
-        return (values - self.lowest) / (self.highest - self.lowest) - 0.5
-
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`."""
         places = data.points.unflatten(1, (-1, 3))
         centre = places.mean((0, 1)) if self.centre is None else self.centre
@@ -78,43 +69,36 @@ class Drift(DeviceSet):
         offsets = OFFSET_RAD_M * data.nominal.jacobian(self.q, data.y.new_zeros(data.nominal.parameters))
         whole = torch.cat([frame, GROWTH * away, offsets], 2)
         whole = whole if data.slopes is None else data.slopes @ whole
-        return (whole[:, :, None] * self.ramp(self.values)[:, None, :, None]).flatten(2)
+        ramp = (self.values - self.known.lowest) / (self.known.highest - self.known.lowest) - 0.5  # from -1/2 to 1/2
+        return (whole[:, :, None] * ramp[:, None, :, None]).flatten(2)
 
     def settled(self, found: Settled) -> Drift:
         """See :class:`DeviceSet`."""
-        own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.joints))
+        own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.known.joints))
         shifts, deviations = (
-            own * each.view(len(self.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
+            own * each.view(len(self.known.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
         )
-        return replace(self, centre=found.centre, size_by_column=shifts, deviations=deviations)
+        known = replace(self.known, centre=found.centre, sizes=shifts, deviations=deviations)
+        return replace(self, known=known, centre=found.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
         """See :class:`DeviceSet`: rows that do not tell the columns are those of the middle."""
         q, values = other.data.q, other.data.covariates
-        middle = (0.5 * (self.lowest + self.highest)).expand(len(q), -1)
-        values = values if other.data.covariate_names == self.names else middle
+        middle = (0.5 * (self.known.lowest + self.known.highest)).expand(len(q), -1)
+        values = values if other.data.covariate_names == self.known.names else middle
         return replace(self, values=values, q=q, centre=other.centre)
 
-    @property
-    def known(self) -> KnownDrift | None:
-        """Drift that a fit found; None before."""
-        if self.size_by_column is None or self.deviations is None or self.centre is None:
-            return None
-        ends = self.lowest, self.highest
-        return KnownDrift(self.names, self.joints, *ends, self.centre, self.size_by_column, self.deviations)
-
-    def placed(self) -> PlacedDevices | None:
+    def placed(self) -> PlacedDevices:
         """The drift, for rows that tell the columns."""
-        return None if self.known is None else self.known.placed()
+        return self.known.placed()
 
     def sentences(self) -> list[str]:
         """How much drifted with each column, of what is known well."""
-        return [] if self.known is None else list(self.known.sentences())
+        return list(self.known.sentences())
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`: unknowns in m and rad over the range of every column."""
-        known = [] if self.size_by_column is None else self.size_by_column.tolist()
-        return {"drift": dict(zip(self.names, known, strict=False))}
+        return {"drift": dict(zip(self.known.names, self.known.sizes.tolist(), strict=True))}
 
 
 def worth_it(before: LeaveOneOut, after: LeaveOneOut) -> bool:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera
@@ -55,15 +55,11 @@ class CameraErrors(DeviceSet):
         """Errors of lenses and board."""
         return self.shared.slopes.shape[2]
 
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`."""
         found = data.y.new_zeros(*data.y.shape, self.size)
         found[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
         return found
-
-    def settled(self, found: Settled) -> Any:
-        """See :class:`DeviceSet`."""
-        return self
 
     def with_rows(self, other: OtherRows) -> Any:
         """See :class:`DeviceSet`."""
@@ -75,18 +71,6 @@ class CameraErrors(DeviceSet):
         """See :class:`DeviceSet`."""
         (shared,) = table.shared_errors()
         return replace(self, shared=shared)
-
-    def placed(self) -> PlacedDevices | None:
-        """Nothing."""
-        return None
-
-    def sentences(self) -> list[str]:
-        """None."""
-        return []
-
-    def entry(self) -> dict[str, object]:
-        """Nothing."""
-        return {}
 
 
 @dataclass(frozen=True, eq=False)

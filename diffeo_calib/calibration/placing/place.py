@@ -23,7 +23,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled, seen_rows
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -245,8 +245,7 @@ class Placed:
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry) if self.free else ()
-        seen = seen_rows(data)
-        return replace(data, shared=self.placement.shared(seen), held=held)
+        return replace(data, shared=self.placement.shared(data), held=held)
 
     def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
         """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
@@ -293,7 +292,7 @@ class Placed:
         own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held)
-        return own, replace(rows, shared=placement.shared(seen_rows(rows)))
+        return own, replace(rows, shared=placement.shared(rows))
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -34,7 +35,7 @@ T = TypeVar("T")
 
 
 class SeenRows(NamedTuple):
-    """N rows around k0, as sets of devices see them.
+    """N rows around k0, as sets of devices see them; so are those of a tangent model.
 
     Args:
         nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured; None for all
@@ -48,9 +49,7 @@ class SeenRows(NamedTuple):
     sensitivities: Tensor
 
 
-def seen_rows(data: Any) -> SeenRows:
-    """These parts of a tangent model."""
-    return SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
+Seen = SeenRows | TangentData
 
 
 class OtherLabel(NamedTuple):
@@ -117,12 +116,12 @@ class DeviceSet(ABC):
         """Number c of shifts that are not known."""
 
     @abstractmethod
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, R, c), m."""
 
-    @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+        return self
 
     @abstractmethod
     def with_rows(self: S, other: OtherRows) -> S:
@@ -140,9 +139,9 @@ class DeviceSet(ABC):
         """The same for rows that tell coordinates, brought into the frame of the model; see :meth:`with_rows`."""
         return self
 
-    @abstractmethod
     def placed(self) -> PlacedDevices | None:
         """Their entries for the model file; None for nothing."""
+        return None
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -155,7 +154,7 @@ class DeviceSet(ABC):
         """How rows that tell coordinates would err under other names of devices; ``seen`` (N, P, 3) by the model, m."""
         return ()
 
-    def changes(self, data: SeenRows) -> Iterable[Cause]:
+    def changes(self, data: Seen) -> Iterable[Cause]:
         """Possible changes of these devices during the measurements, with their effects (N, R, U) on all rows."""
         return ()
 
@@ -163,7 +162,7 @@ class DeviceSet(ABC):
         """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
         return ()
 
-    def doubts(self, data: SeenRows) -> Iterable[Cause]:
+    def doubts(self, data: Seen) -> Iterable[Cause]:
         """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
         return ()
 
@@ -191,13 +190,13 @@ class DeviceSet(ABC):
         """(D, 3) places in the measuring frame, m, to which a row of this kind brings the ball; None for anywhere."""
         return None
 
-    @abstractmethod
     def sentences(self) -> list[str]:
         """Where the devices are."""
+        return []
 
-    @abstractmethod
     def entry(self) -> dict[str, object]:
         """The same for programs, in m and rad."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -217,15 +216,11 @@ class Placement:
         """The first set of a kind; None without one."""
         return next((own for own in self.sets if isinstance(own, kind)), None)
 
-    def changes(self, data: SeenRows) -> list[Cause]:
+    def changes(self, data: Seen) -> list[Cause]:
         """Possible changes of all devices."""
         return [cause for own in self.sets for cause in own.changes(data)]
 
-    def groups(self) -> Iterable[tuple[str, Tensor]]:
-        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
-        return ()
-
-    def doubts(self, data: SeenRows) -> list[Cause]:
+    def doubts(self, data: Seen) -> list[Cause]:
         """What all devices are said to hold."""
         return [cause for own in self.sets for cause in own.doubts(data)]
 
@@ -251,7 +246,7 @@ class Placement:
         """See :meth:`DeviceSet.places_at`."""
         return next((places for own in self.sets if (places := own.places_at(row)) is not None), None)
 
-    def shared(self, data: SeenRows) -> Tensor | None:
+    def shared(self, data: Seen) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""
         effects = [own.effects(data) for own in self.sets]
         return torch.cat(effects, dim=2) if effects else None

@@ -28,7 +28,7 @@ from diffeo_calib.calibration.identification.identification import (
     solve,
     weighed_fits,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
@@ -79,26 +79,26 @@ class ReadingDevices(DeviceSet):
         """(M,) number of each row's device."""
         return self.devices.numbers(self.data)
 
-    def _seen(self, data: SeenRows) -> Tensor:
+    def _seen(self, data: Seen) -> Tensor:
         """(M, 3 k) coordinates of what the devices see, m."""
         return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
 
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`."""
         own = self.devices.shared(self._seen(data), self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
         found[self.rows[:, None], self.numbers] = own
         return found
 
-    def changes(self, data: SeenRows) -> Iterator[Cause]:
+    def changes(self, data: Seen) -> Iterator[Cause]:
         """See :class:`DeviceSet`: every device moved, or its zero was set anew."""
         yield from self._causes(data, self.devices.changes(self._seen(data), self.device))
 
-    def doubts(self, data: SeenRows) -> Iterator[Cause]:
+    def doubts(self, data: Seen) -> Iterator[Cause]:
         """See :class:`DeviceSet`."""
         yield from self._causes(data, self.devices.doubts(self._seen(data), self.device))
 
-    def _causes(self, data: SeenRows, found: Iterable[Effect]) -> Iterator[Cause]:
+    def _causes(self, data: Seen, found: Iterable[Effect]) -> Iterator[Cause]:
         """Effects (M, r, U) on the rows of these devices as effects on all rows."""
         for effect in found:
             whole = effect.motion.new_zeros(*data.y.shape, effect.motion.shape[2])

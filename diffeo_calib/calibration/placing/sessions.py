@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -171,7 +171,7 @@ class Sessions(DeviceSet):
         """Numbers of each session but the reference."""
         return len(self.others) * self.set_ups.increments_each
 
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences."""
         tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
         by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]

@@ -34,7 +34,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, SeenRows, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
@@ -218,7 +218,7 @@ class SocketDevices(DeviceSet):
         """Three of each socket."""
         return self.places.root.shape[1]
 
-    def doubts(self, data: SeenRows) -> Iterator[Cause]:
+    def doubts(self, data: Seen) -> Iterator[Cause]:
         """See :class:`DeviceSet`: the known distances, the same at all places."""
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.places.sockets.blocks:
@@ -234,7 +234,7 @@ class SocketDevices(DeviceSet):
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
             yield Cause(name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix)
 
-    def effects(self, data: SeenRows) -> Tensor:
+    def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
         effects = self.places.shared(self.socket, data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
