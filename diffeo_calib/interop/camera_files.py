@@ -51,9 +51,9 @@ def _hand_eye(own: HandEye) -> str:
     lines = ["%YAML:1.0", "---", f'camera_parent: "{own.camera.link}"']
     for name, fixed in vars(own).items():
         for part, rows, values in (
-            ("R", 3, fixed.known.pose[:3, :3]),
-            ("t", 3, fixed.known.pose[:3, 3]),
-            ("covariance", 6, fixed.known.covariance),  # of shift, m, and turn, rad
+            ("R", 3, fixed.pose[:3, :3]),
+            ("t", 3, fixed.pose[:3, 3]),
+            ("covariance", 6, fixed.covariance),  # of shift, m, and turn, rad
         ):
             lines += matrix_lines(f"{name}_{part}", rows, values.flatten().tolist())
     return "\n".join([*lines, ""])
@@ -61,7 +61,7 @@ def _hand_eye(own: HandEye) -> str:
 
 def _joint(own: HandEye, name: str) -> str:
     """A link and a fixed joint, to include in a xacro file of the robot."""
-    xyz, rpy = (" ".join(f"{value!r}" for value in part) for part in origin_numbers(own.camera.known.pose))
+    xyz, rpy = (" ".join(f"{value!r}" for value in part) for part in origin_numbers(own.camera.pose))
     frame = quoteattr(f"{name}{FRAME}")
     return f"""<?xml version="1.0"?>
 <robot xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -77,8 +77,8 @@ def _joint(own: HandEye, name: str) -> str:
 
 def _launch(own: HandEye, name: str) -> str:
     """A launch file of ROS 2 that publishes the camera's frame."""
-    turn = rotation_numbers(own.camera.known.pose[None, :3, :3], "quat_xyzw")[0].tolist()
-    numbers = [*own.camera.known.pose[:3, 3].tolist(), *turn]
+    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
+    numbers = [*own.camera.pose[:3, 3].tolist(), *turn]
     named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)
     words = [*(f"--{name} {value!r}" for name, value in named), f"--frame-id {own.camera.link}"]
     arguments = quoteattr(" ".join([*words, f"--child-frame-id {name}{FRAME}"]))

@@ -31,10 +31,16 @@ RIGID_MOTION_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class KnownPose:
-    """A pose (4, 4) [m] and the covariance (6, 6) of its shift and turn [m, rad], in the axes of the frame it is in."""
+    """A pose (4, 4) [m] and the covariance (6, 6) of its shift and turn [m, rad], in the axes of the frame of a link.
+
+    ``where`` and ``key``: what messages and files call this frame.
+    """
 
     pose: Tensor
     covariance: Tensor
+    link: str
+    where: str
+    key: str
 
     @property
     def deviations(self) -> Tensor:
@@ -58,21 +64,12 @@ class KnownPose:
         yield f"  known to {_numbers(1e3 * position)} mm and {_numbers(rotation.rad2deg())} deg (standard deviations)"
 
 
-class Fixed(NamedTuple):
-    """A pose in the frame of a link, and what messages and files call this frame."""
-
-    known: KnownPose
-    link: str
-    where: str
-    key: str
-
-
 @dataclass(frozen=True, eq=False)
 class HandEye:
     """A camera and its board: one of them is fixed to the robot's tip, the other stands."""
 
-    camera: Fixed
-    board: Fixed
+    camera: KnownPose
+    board: KnownPose
 
     @classmethod
     def of(
@@ -113,8 +110,8 @@ class HandEye:
         moved[:3, 3:] = skew(standing[:3, 3])
         found = moved @ _covariance(fitted, geometry.slices["base"], set_up.seen_from(geometry.base)) @ moved.mT
         tip, base = geometry.on[0], model.robot.base
-        carried_there = Fixed(KnownPose(carried[0], known), tip, f"in the frame of '{tip}'", "in_tip")
-        standing_there = Fixed(KnownPose(standing, found), base, "in the robot's base", "in_base")
+        carried_there = KnownPose(carried[0], known, tip, f"in the frame of '{tip}'", "in_tip")
+        standing_there = KnownPose(standing, found, base, "in the robot's base", "in_base")
         return cls(*((carried_there, standing_there) if camera_on_tool else (standing_there, carried_there)))
 
     @classmethod
@@ -131,7 +128,7 @@ class HandEye:
 
     def entry(self) -> dict[str, object]:
         """Both poses for programs."""
-        return {f"{name}_{own.key}": own.known.entry() for name, own in vars(self).items()}
+        return {f"{name}_{own.key}": own.entry() for name, own in vars(self).items()}
 
 
 def hand_eye_entry(found: Mapping[str, HandEye]) -> dict[str, object]:
@@ -144,8 +141,8 @@ def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
     """Every camera and the board with their deviations."""
     for name, own in found.items():
         which = "camera" if len(found) == 1 else f"camera '{name}'"
-        yield from own.camera.known.sentences(f"{which} {own.camera.where} (hand-eye transform)")
-    yield from (line for own in [*found.values()][:1] for line in own.board.known.sentences(f"board {own.board.where}"))
+        yield from own.camera.sentences(f"{which} {own.camera.where} (hand-eye transform)")
+    yield from (line for own in [*found.values()][:1] for line in own.board.sentences(f"board {own.board.where}"))
 
 
 class SetUp(NamedTuple):

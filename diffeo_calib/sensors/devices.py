@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.quantiles import SMALLEST_MEDIAN_M, median_weights
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
@@ -29,7 +30,6 @@ ROUNDS = 20
 """Steps of a refinement."""
 OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
-SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
 FEWEST_PER_DEVICE = 8
 """Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
@@ -265,9 +265,9 @@ class Devices(ABC):
         devices = self
         for _ in range(ROUNDS):
             errors, slopes = devices.errors(data, points), devices.shared(points, devices.numbers(data))
-            size = errors.norm(dim=1, keepdim=True)
+            size = errors.norm(dim=1)
             level = size.median().clamp(min=SMALLEST_MEDIAN_M)
-            weight = (1 / (1 + (size / (OUTLIER_MEDIANS * level)) ** 2).sqrt() / level)[..., None]
+            weight = (median_weights(size, OUTLIER_MEDIANS).sqrt() / level)[:, None, None]
             eye = torch.eye(slopes.shape[2], dtype=slopes.dtype, device=slopes.device)
             matrix = torch.cat([(weight * slopes).flatten(0, 1), eye])
             target = torch.cat([(weight[..., 0] * errors).flatten(), eye[0] * 0.0])

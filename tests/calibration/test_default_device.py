@@ -121,10 +121,9 @@ def test_joint_offsets(measured: Measured) -> None:
 @pytest.mark.parametrize("noise", [None, 1e-4])
 def test_identification(noise: float | None, measured: Measured) -> None:
     data, geometry = measured.data, measured.nominal.geometry
-    given = None if noise is None else torch.tensor(noise, dtype=torch.float64)
 
     def work() -> list[Any]:
-        found = identify(geometry, data.q, data.points, given)
+        found = identify(geometry, data.q, data.points, noise)
         return [found.theta, found.covariance, found.noise, found.tails, found.prior, found.geometry.joint_errors]
 
     same(work)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -15,7 +14,6 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -150,33 +148,6 @@ def test_parameters_are_those_that_were_absorbed() -> None:
     assert found.rms == pytest.approx(rms(found.geometry, q, points))
 
 
-def test_noise_of_every_marker_by_itself() -> None:
-    arm = SimulatedArm(seed=2, markers=2, transmission=0, gravity=0, noise=1e-5)
-    q, points = arm.measure(60)
-    spoilt = points.clone()
-    spoilt[:, 1] += draw(60, 3, size=5e-3)
-    noise = torch.tensor([1e-5, 5e-3], dtype=torch.float64).expand(60, 2)
-    start, test = register(arm.nominal, q, points).geometry, arm.sample(300, seed=9)
-    each, one = identify(start, q, spoilt, noise=noise).geometry, identify(start, q, spoilt, noise=1e-5).geometry
-    truth = arm.true_points(test)[:, 0]
-    assert float((each.points(test)[:, 0] - truth).norm(dim=-1).mean()) < 5e-5
-    assert float((one.points(test)[:, 0] - truth).norm(dim=-1).mean()) > 2e-4
-
-
-def test_given_noise_weighs_poses() -> None:
-    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=1e-5)
-    q, points = arm.measure(80)
-    spoilt = points.clone()
-    spoilt[:10] += draw(10, 1, 3, size=0.02)
-    noise = torch.full((80,), 1e-5, dtype=torch.float64)
-    noise[:10] = 0.02
-    test = arm.sample(300, seed=9)
-    start = register(arm.nominal, q, spoilt).geometry
-    one = identify(start, q, spoilt, noise=1e-5).geometry
-    each = identify(start, q, spoilt, noise=noise).geometry
-    assert rms(each, test, arm.true_points(test)) < 5e-5 < rms(one, test, arm.true_points(test))
-
-
 def test_the_prior_decides_where_the_data_do_not() -> None:
     arm = SimulatedArm(seed=3, transmission=0, gravity=0)
     q, points = arm.measure(4)
@@ -214,21 +185,6 @@ def rotation_vectors(matrices: Tensor) -> Tensor:
     w = torch.stack([half[:, 2, 1], half[:, 0, 2], half[:, 1, 0]], dim=1)
     torch.testing.assert_close(rotation(w), matrices, rtol=0, atol=1e-6)
     return w
-
-
-def test_wrong_input_is_explained() -> None:
-    q, points = ARM.measure(10)
-    geometry = Geometry.nominal(ARM.nominal)
-    with pytest.raises(MeasurementError, match=r"one row per pose each: expected as many rows, got 10 and 9 rows"):
-        identify(geometry, q, points[:9])
-    with pytest.raises(MeasurementError, match="`points`: expected 1 markers, as the geometry has, got 2"):
-        identify(geometry, q, points.expand(10, 2, 3))
-    with pytest.raises(MeasurementError, match=re.escape("`noise`: expected one value, 10, or (10, 1), got (3,)")):
-        identify(geometry, q, points, noise=torch.ones(3))
-    with pytest.raises(InputError, match="`noise`: expected positive numbers"):
-        identify(geometry, q, points, noise=0.0)
-    with pytest.raises(InputError, match=r"`Prior.rotation`: expected positive numbers"):
-        Prior(rotation=-1.0)
 
 
 def test_a_ur10(ur10_folder: Path) -> None:

@@ -96,11 +96,11 @@ def test_both_cameras_are_where_they_are_whoever_holds_the_frame() -> None:
         rows = images_of_both(arms(), counts, 0.1)
         found = HandEye.of_each(dc.calibrate(kind().robot, rows, hyperparameters=SCALES).model, camera_on_tool=False)
         for name, arm in zip(("left", "right"), arms(), strict=True):
-            own = found[name].camera.known
+            own = found[name].camera
             away = own.pose[:3, 3] - torch.linalg.inv(arm.arm.truth.base)[:3, 3]
             assert bool((away.abs() < 4 * own.deviations[:3]).all())
             known.setdefault(name, []).append(own.deviations)
-        board = found["left"].board.known
+        board = found["left"].board
         assert bool(
             ((board.pose[:3, 3] - board.pose.new_tensor(BOARD_ON_FLANGE)).abs() < 4 * board.deviations[:3]).all()
         )
@@ -145,7 +145,7 @@ def check_hand_eyes(model: Any, largest_std: float) -> None:
     found = HandEye.of_each(model, camera_on_tool=True)
     assert set(found) == set(PLACES_ON_TOOL)
     for name, given in PLACES_ON_TOOL.items():
-        truth, known = torch.tensor(given, dtype=torch.float64), found[name].camera.known
+        truth, known = torch.tensor(given, dtype=torch.float64), found[name].camera
         away = known.pose[:3, :3] @ rotation(truth[None, 3:])[0].mT
         turn = 0.5 * (away - away.mT)[[2, 0, 1], [1, 2, 0]]
         errors = torch.cat([known.pose[:3, 3] - truth[:3], turn])
@@ -170,7 +170,7 @@ def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> 
 def test_fixed_cameras_of_a_recalibrated_model_are_where_they_are() -> None:
     found = HandEye.of_each(dc.recalibrate(kind().model, kind().moved).model, camera_on_tool=False)
     for name, arm in zip(("left", "right"), arms(), strict=True):
-        own = found[name].camera.known
+        own = found[name].camera
         away = own.pose[:3, 3] - torch.linalg.inv(arm.arm.truth.base)[:3, 3]
         assert bool((away.abs() < 4 * own.deviations[:3]).all())
         assert float(own.deviations[:3].max()) < 2e-3

@@ -80,8 +80,8 @@ def test_the_errors_of_a_camera_are_those_of_the_board_it_sees(seen: CameraArm) 
     given = torch.tensor(CAMERA, dtype=torch.float64, device=HOST)
     corner = torch.tensor(BOARD, dtype=torch.float64, device=HOST) - middle
     for one, place, turn in (
-        (found.camera.known, given[:3], given[3:]),
-        (found.board.known, corner, torch.zeros_like(corner)),
+        (found.camera, given[:3], given[3:]),
+        (found.board, corner, torch.zeros_like(corner)),
     ):
         shift = one.pose[:3, 3] - place
         away = rotation(turn).mT @ one.pose[:3, :3]

@@ -59,15 +59,15 @@ def check(known: KnownPose, place: Any, turn: Tensor | None = None) -> None:
 
 def test_a_camera_on_the_tool_is_where_it_is() -> None:
     found = HandEye.of(on_tool())
-    check(found.camera.known, CAMERA[:3], rotation(torch.tensor(CAMERA[3:], dtype=torch.float64)))
+    check(found.camera, CAMERA[:3], rotation(torch.tensor(CAMERA[3:], dtype=torch.float64)))
     assert set(found.entry()) == {"camera_in_tip", "board_in_base"}
     assert camera_of(on_tool()).on_tool
 
 
 def test_a_fixed_camera_is_where_it_is() -> None:
     found = HandEye.of(fixed(), camera_on_tool=False)
-    check(found.camera.known, FIXED_CAMERA[0])
-    check(found.board.known, BOARD_ON_FLANGE, torch.eye(3, dtype=torch.float64))
+    check(found.camera, FIXED_CAMERA[0])
+    check(found.board, BOARD_ON_FLANGE, torch.eye(3, dtype=torch.float64))
     assert found.camera.link == fixed().robot.base
     assert not camera_of(fixed()).on_tool
     assert any(
@@ -90,13 +90,13 @@ def test_files_read_back_are_lens_and_place(model: Any, tmp_path: Path) -> None:
     assert origin is not None
     assert parent is not None
     xyz, rpy = ([float(word) for word in origin.attrib[name].split()] for name in ("xyz", "rpy"))
-    assert_close(torch.tensor(xyz, dtype=torch.float64), found.camera.known.pose[:3, 3])
-    assert_close(roll_pitch_yaw(*rpy), found.camera.known.pose[:3, :3])
+    assert_close(torch.tensor(xyz, dtype=torch.float64), found.camera.pose[:3, 3])
+    assert_close(roll_pitch_yaw(*rpy), found.camera.pose[:3, :3])
     assert parent.attrib["link"] == found.camera.link
     words = ET.fromstring(files["static_transform.launch.xml"])[0].attrib["args"].split()
     said = dict(zip(words[::2], words[1::2], strict=True))
     turn = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
-    assert_close(torch.from_numpy(turn), found.camera.known.pose[:3, :3])
+    assert_close(torch.from_numpy(turn), found.camera.pose[:3, :3])
     assert said["--frame-id"] == found.camera.link
 
 
@@ -108,7 +108,7 @@ def test_opencv_reads_the_files(tmp_path: Path) -> None:
     read = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
     assert_close(torch.from_numpy(read.getNode("distortion_coefficients").mat())[0], lens[4:])
     read = cv2.FileStorage(str(tmp_path / "hand_eye.yaml"), cv2.FILE_STORAGE_READ)
-    pose = HandEye.of(on_tool()).camera.known.pose
+    pose = HandEye.of(on_tool()).camera.pose
     assert_close(torch.from_numpy(read.getNode("camera_R").mat()), pose[:3, :3])
     assert_close(torch.from_numpy(read.getNode("camera_t").mat())[:, 0], pose[:3, 3])
     assert read.getNode("camera_parent").string() == "flange"
@@ -127,7 +127,7 @@ def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     numbers = re.search(r"camera_t:.*?\[(.*?)\]", other, re.S)
     assert numbers is not None
     away = torch.tensor([float(word) for word in numbers[1].split(",")], dtype=torch.float64)
-    assert float((away - HandEye.of(on_tool()).camera.known.pose[:3, 3]).norm()) < 5e-3
+    assert float((away - HandEye.of(on_tool()).camera.pose[:3, 3]).norm()) < 5e-3
     wrong = command("export", kind_named("positions").file, "--camera", folder)
     assert wrong.code == 1
     assert "saw a board in images" in wrong.error

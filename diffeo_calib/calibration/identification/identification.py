@@ -17,16 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.device import seeded
-from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.threads import torch_alone
-from diffeo_calib.measurements.checks import marker_places
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 
 MEDIAN_CHI2_3 = 2.37
@@ -68,9 +64,6 @@ class Prior:
         base_translation: of the base [m].
         base_rotation: of the base [rad].
         tool: of the markers [m].
-
-    Raises:
-        InputError: a value that is not a positive number.
     """
 
     translation: float = 1e-3
@@ -78,10 +71,6 @@ class Prior:
     base_translation: float = PLACES.sought_base_m_rad
     base_rotation: float = PLACES.sought_base_m_rad
     tool: float = PLACES.marker_m
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            positive(value, f"Prior.{name}")
 
     def root(self, geometry: Geometry, held: Sequence[int] = ()) -> Tensor:
         """Square root (K, f) of the covariance of the parameters of ``geometry``, of which some are held [m or rad]."""
@@ -149,7 +138,7 @@ def identify(
     geometry: Geometry,
     q: Tensor,
     points: Tensor,
-    noise: float | Tensor | None = None,
+    noise: float | None = None,
     prior: Prior | None = None,
     *,
     shared: Tensor | None = None,
@@ -165,26 +154,22 @@ def identify(
         geometry: the start, and the centre of the prior.
         q: (N, n) joint values [rad or m].
         points: (N, P, 3) measured markers [m]; NaN where they are hidden.
-        noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
+        noise: standard deviation of one coordinate [m].
         prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
         shared: (N, P, 3, c) effects Z of shifts of unit variance that rows share [m].
         held: numbers of parameters that stay zero.
 
-    Raises:
-        InputError: wrong shapes, or values that are not finite.
-        MeasurementError: another number of markers than the geometry has, or numbers of rows that differ.
-
     Note:
         Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
-    q, points = checked_rows(geometry.chain, q, points, geometry.markers)
+    q, points = q.detach().cpu(), points.detach().cpu()
     own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
     rows = Rows(geometry, (own,))
     if noise is not None:
-        sigma, used = _given_noise(noise, points), prior or Prior()
+        sigma, used = points.new_full(points.shape[:2], noise), prior or Prior()
         fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
         left = fit.errors
-        tails, level = Tails.none(*points.shape[:2], device=points.device), float(sigma.square().mean().sqrt())
+        tails, level = Tails.none(*points.shape[:2], device=points.device), noise
     else:
         fit, used, tails, level = _estimate(Rows(geometry, (own.sample(),)), prior, held)
         left = rows.errors(fit.theta, fit.shifts)
@@ -382,7 +367,8 @@ def solve(rows: Rows, sigma: Tensor, root: Tensor, *, start: Tensor | None = Non
 
     Args:
         rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of all rows, m.
-        root: (K, f) square root of the prior covariance of the errors, of orthogonal columns. start: (K,). options: of scipy.
+        root: (K, f) square root of the prior covariance of the errors, its columns orthogonal. start: (K,).
+        options: of scipy.
     """
     f = root.shape[1]
     u0 = root.new_zeros(f + sum(own.freedom for own in rows.parts))
@@ -439,33 +425,6 @@ def least_squares_of(
     leverage = torch.from_numpy(np.square(U[: -len(fit.x)]).sum(1))
     u, root = torch.from_numpy(fit.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
     return Minimum(u, root, leverage, int(fit.nfev), fit.status > 0)
-
-
-def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
-    """Check joint values and points against each other, and return both detached, on the CPU."""
-    q = chain.joint_values(q).detach().cpu()
-    fix = "pass metres, one row per pose"
-    three = isinstance(points, Tensor) and points.ndim == 3
-    points = marker_places(points).cpu() if three else as_tensor(points, "points", ("N", "P", 3), fix=fix)
-    if len(points) != len(q):
-        what = "`q` and `points` must have one row per pose each"
-        got = f"{len(q)} and {len(points)} rows"
-        raise MeasurementError.of(what, expected="as many rows", got=got, fix="check how they were read")
-    if markers is not None and points.shape[1] != markers:
-        expected, got = f"{markers} markers, as the geometry has", str(points.shape[1])
-        raise MeasurementError.of("`points`", expected=expected, got=got, fix="register them together first")
-    return q, points
-
-
-def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
-    """Standard deviation of every marker (N, P)."""
-    N, P, _ = points.shape
-    shape = ((), ("N",), ("N", "P"))[min(noise.ndim, 2)] if isinstance(noise, Tensor) else ()
-    given = positive(noise, "noise", shape).detach().cpu()
-    if tuple(given.shape) not in ((), (N,), (N, P)):
-        expected = f"one value, {N}, or ({N}, {P})"
-        raise MeasurementError.of("`noise`", expected=expected, got=str(tuple(given.shape)))
-    return (given[:, None] if given.ndim == 1 else given).expand(N, P)
 
 
 def in_mm(rms: float, noise: float, how: str) -> str:

@@ -31,14 +31,13 @@ from diffeo_calib.calibration.identification.identification import (
     MeasuredPoints,
     Prior,
     Rows,
-    checked_rows,
     identify,
     in_mm,
     solve,
 )
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.common.quantiles import known, largest_known
+from diffeo_calib.common.quantiles import known, largest_known, median_weights
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
@@ -61,12 +60,10 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
         on: names of their tips, P of them; the robot's first tip by default.
 
     Raises:
-        InputError: wrong shapes, or values that are not finite.
-        MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), a marker that no row shows, or numbers of
-            rows that differ.
+        MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), or a marker that no row shows.
     """
     chain = robot.chain if isinstance(robot, Geometry) else robot
-    q, points = checked_rows(chain, q, points)
+    q, points = q.detach().cpu(), points.detach().cpu()
     bare = Geometry.nominal(chain, points.shape[1], on)
     if isinstance(robot, Geometry):
         bare = replace(
@@ -171,7 +168,7 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         root = weights.sqrt()
         ball = _determined_part((root[:, None, None] * A).flatten(0, 1), -(root[:, None] * b).flatten())
         distances = (A @ ball + b).norm(dim=1)
-        before, weights = weights, median_weights(distances)
+        before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
             break
     seen = R @ ball + t
@@ -185,14 +182,8 @@ def socket_means(points: Tensor, socket: Tensor) -> Tensor:
     weights = torch.ones_like(points[:, 0])
     for _ in range(ROUNDS):
         means = _means(points, socket, weights)
-        weights = median_weights((points - means[socket]).norm(dim=1))
+        weights = median_weights((points - means[socket]).norm(dim=1), HALF_WEIGHT_MEDIANS)
     return means
-
-
-def median_weights(distances: Tensor) -> Tensor:
-    """Weights (N,) of rows by their distances (N,) in medians: 1 / (1 + (d / 2 medians)^2)."""
-    scale = HALF_WEIGHT_MEDIANS * distances.median().clamp(min=LIMITS.smallest_noise_m)
-    return 1.0 / (1.0 + (distances / scale).square())
 
 
 def _means(values: Tensor, socket: Tensor, weights: Tensor) -> Tensor:

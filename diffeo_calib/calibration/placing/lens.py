@@ -16,11 +16,13 @@ from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.cameras.seeing import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.common.quantiles import median_weights
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
+from diffeo_calib.sensors.devices import OUTLIER_MEDIANS
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View
 
@@ -232,8 +234,7 @@ def relative_size(
     for _ in range(ROUNDS):
         matrix, target = (weights * slopes).flatten(0, 1), (weights[..., 0] * errors).flatten()
         found = torch.linalg.lstsq(matrix, target[:, None], driver="gelsd").solution[:, 0]
-        size = (errors - slopes @ found).norm(dim=1)
-        weights = (1 / (1 + (size / (3 * size.median().clamp(min=1e-9))) ** 2).sqrt())[:, None, None]
+        weights = median_weights((errors - slopes @ found).norm(dim=1), OUTLIER_MEDIANS).sqrt()[:, None, None]
     return float(found[-1])
 
 

@@ -161,9 +161,7 @@ class FoundReadings:
     devices: tuple[Devices, ...]
 
 
-def identify_readings(
-    bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False, ball: Tensor | None = None
-) -> FoundReadings:
+def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
     """Find ball, devices and geometric errors.
 
     Args:
@@ -182,11 +180,11 @@ def identify_readings(
     poses = [bare.marker_poses(data.q) for data in tables]
     for data, T in zip(tables, poses, strict=True):
         kind_of(data).check_unit(data, T[:, 0, :3, :3], T[:, 0, :3, 3])
-    found = _rough_fits(bare, tables, still, _starts(bare.tool[0], tables, poses), poses)
+    found = _rough_fits(bare, still, _starts(bare.tool[0], tables, poses), poses)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
         again = [(ball, _around(ball, tables, poses)) for ball in balls]
-        found += _rough_fits(bare, tables, still, again, poses)
+        found += _rough_fits(bare, still, again, poses)
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
@@ -194,40 +192,26 @@ def identify_readings(
     doubted = [kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each]
     if any(doubted) or worst[0] > LARGEST_SHARE * bare.chain.reach:
         _doubt(bare, tables, still, poses, worst)
-    rms = _rms(rough.errors)
-    start = rows.geometry.absorb(rough.theta)
-    count = sum(map(len, tables))
-    registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(count, 1))
-    parts = _parts(tables, _moved(rows, rough.shifts))
-    return _estimate(Rows(start, parts, rows.poses if rigid else None), still if rigid else root, registration)
-
-
-def _parts(tables: Sequence[Readings], devices: Sequence[Devices]) -> tuple[ReadRows, ...]:
-    return tuple(ReadRows(*own) for own in zip(tables, devices, strict=True))
+    rms, start = _rms(rough.errors), rows.geometry.absorb(rough.theta)
+    nothing, tails = torch.zeros_like(rough.covariance), Tails.none(sum(map(len, tables)), 1)
+    status = "ball and devices found."
+    registration = Identification(start, rms, rms, nothing, 0, status, nothing[0], Prior(), tails)
+    rows = Rows(start, _moved(rows, rough.shifts), rows.poses if rigid else None)
+    return _estimate(rows, still if rigid else root, registration)
 
 
 def _rough_fits(
-    bare: Geometry,
-    tables: Sequence[Readings],
-    root: Tensor,
-    starts: Sequence[tuple[Tensor, list[Devices]]],
-    poses: Sequence[Tensor],
+    bare: Geometry, root: Tensor, starts: Sequence[tuple[Tensor, list[ReadRows]]], poses: Sequence[Tensor]
 ) -> list[tuple[tuple[float, str], Fit, Rows]]:
     """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
     found = []
-    for ball, devices in starts:
-        rows = Rows(bare.with_tool(ball[None]), _parts(tables, devices), poses)
-        sigma = ball.new_full((sum(map(len, tables)), 1), ROUGH_M)
+    for ball, parts in starts:
+        rows = Rows(bare.with_tool(ball[None]), tuple(parts), poses)
+        sigma = ball.new_full((sum(len(own.q) for own in parts), 1), ROUGH_M)
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             rough = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
-            found.append((_of_worst_device(tables, rough.errors), rough, rows))
+            found.append((_of_worst_device(parts, rough.errors), rough, rows))
     return found
-
-
-def _nothing(geometry: Geometry) -> tuple[Tensor, int, str, Tensor]:
-    """Covariance, iterations, status and theta of a registration that says nothing about them."""
-    zero = geometry.tool.new_zeros(geometry.size)
-    return torch.outer(zero, zero), 0, "ball and devices found.", zero
 
 
 def with_ball_of(
@@ -275,13 +259,13 @@ def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> Foun
     freed = [devices.freed() for devices in found.registered]
     if all(devices is None for devices in freed):
         return None
-    devices = [own if free is None else free for own, free in zip(found.registered, freed, strict=True)]
-    geometry = found.registration.geometry
+    each, geometry = zip(tables, found.registered, freed, strict=True), found.registration.geometry
+    parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
     root = Prior().root(geometry, held_parameters(geometry))
-    return _estimate(Rows(geometry, _parts(tables, devices)), root, found.registration)
+    return _estimate(Rows(geometry, parts), root, found.registration)
 
 
-def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
+def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[ReadRows]]]:
     """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball where it was."""
     found = [(usual, _around(usual, tables, poses))]
     for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
@@ -292,16 +276,16 @@ def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) 
         found += [(ball, _around(ball, tables, poses)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
         if len(each) == len(rows):
             middle = torch.stack([ball for ball, _ in each]).median(0).values
-            devices = _around(middle, tables, poses)
-            devices[place] = kind.of(data, torch.stack([constants for _, constants in each]))
-            found.append((middle, devices))
+            parts = _around(middle, tables, poses)
+            parts[place] = ReadRows(data, kind.of(data, torch.stack([constants for _, constants in each])))
+            found.append((middle, parts))
     return found
 
 
-def _around(ball: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[Devices]:
+def _around(ball: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[ReadRows]:
     """The devices in closed form for a ball (3,) in the tip's frame, m."""
     points = [T[:, 0, :3, :3] @ ball + T[:, 0, :3, 3] for T in poses]
-    return [kind_of(data).at(data, z) for data, z in zip(tables, points, strict=True)]
+    return [ReadRows(data, kind_of(data).at(data, z)) for data, z in zip(tables, points, strict=True)]
 
 
 def _estimate(rows: Rows, root: Tensor, registration: Identification) -> FoundReadings:
@@ -319,8 +303,11 @@ def _estimate(rows: Rows, root: Tensor, registration: Identification) -> FoundRe
         tails=tails,
         status=f"{in_mm(rms, level, 'estimated')}.",
     )
-    registered = tuple(own.devices for own in rows.parts if isinstance(own, ReadRows))
-    return FoundReadings(registration, identification, registered, _moved(rows, fit.shifts))
+    each = [
+        tuple(own.devices for own in parts if isinstance(own, ReadRows))
+        for parts in (rows.parts, _moved(rows, fit.shifts))
+    ]
+    return FoundReadings(registration, identification, *each)
 
 
 def _rms(errors: Sequence[Tensor]) -> float:
@@ -328,17 +315,17 @@ def _rms(errors: Sequence[Tensor]) -> float:
     return float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt())
 
 
-def _moved(rows: Rows, shifts: Tensor) -> tuple[Devices, ...]:
-    """The devices of all rows after shifts."""
+def _moved(rows: Rows, shifts: Tensor) -> tuple[ReadRows, ...]:
+    """All rows with their devices after shifts."""
     each = zip(rows.parts, rows.split(shifts), strict=True)
-    return tuple(own.moved(some) for own, some in each if isinstance(own, ReadRows))
+    return tuple(own._replace(devices=own.moved(some)) for own, some in each if isinstance(own, ReadRows))
 
 
-def _of_worst_device(tables: Sequence[Readings], errors: Sequence[Tensor]) -> tuple[float, str]:
+def _of_worst_device(parts: Sequence[ReadRows], errors: Sequence[Tensor]) -> tuple[float, str]:
     """The largest median residual of a device's readings, m, and its name: one wrong plane of three shows in it."""
     return max(
         (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
-        for data, own in zip(tables, errors, strict=True)
+        for (data, _), own in zip(parts, errors, strict=True)
         for number, name in enumerate(data.names)
     )
 
@@ -359,7 +346,7 @@ def _doubt(
     }
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(bare, other, root, _starts(bare.tool[0], other, poses), poses)
+        found = _rough_fits(bare, root, _starts(bare.tool[0], other, poses), poses)
         if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
