@@ -16,11 +16,12 @@ from diffeo_calib.calibration.identification.identification import Prior, identi
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import held_parameters
-from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
@@ -136,7 +137,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
     assert devices is not None
-    socket, own = devices.socket, devices.places.sockets.place[devices.socket] == 2
+    socket, own = devices.socket, devices.sockets.place[devices.socket] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
     gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
@@ -183,8 +184,9 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
     bare = replace(data.sockets, distances=(), distance_std=None)  # type: ignore[type-var]
     thetas = []
     for shift in (0.0, 3e-3):
-        places = SocketPlaces.around(bare, found.positions + shift * torch.tensor([1.0, -1.0, 0.5]).double())
-        placed, shared = places.placed(data), places.shared(data.socket, 3).unflatten(1, (-1, 3))  # type: ignore[arg-type]
+        away = shift * torch.tensor([1.0, -1.0, 0.5]).double()
+        places = SocketDevices.around(with_attributes(data, sockets=bare), found.positions + away)
+        placed, shared = places.at_places(data), places.shared(3).unflatten(1, (-1, 3))
         held = held_parameters(geometry)
         given = 1e-4, Prior()
         thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)
@@ -205,7 +207,7 @@ def test_distances_of_a_block_have_one_error() -> None:
         ({(f"{p}/0", f"{p}/1"): 0.05 + 1e-9 * k for k, p in enumerate("abcdef")}, 1e-4 / 6**0.5),
     ):
         data = dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-4, doubt=False)
-        places = SocketPlaces.around(data.sockets, at)  # type: ignore[arg-type]
+        places = SocketDevices.around(data, at)
         assert float((mean.flatten() @ places.root).norm()) == pytest.approx(deviation, rel=0.01)
 
 

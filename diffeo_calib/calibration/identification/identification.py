@@ -250,26 +250,26 @@ class Rows:
 
     Args:
         geometry: the start. parts: the rows.
-        poses: (N, P, 4, 4) of the markers' tips at the rows of every part where errors of joints and base stay zero, so
+        tips: (N, P, 4, 4) their poses at the rows of every part where errors of joints and base stay zero, so
             that only the markers move; None where they may not.
     """
 
     geometry: Geometry
     parts: tuple[MeasuredPoints | ReadRows, ...]
-    poses: Sequence[Tensor] | None = None
+    tips: Sequence[Tensor] | None = None
 
     def points(self, theta: Tensor) -> list[Tensor]:
         """The markers (N, P, 3) at the rows of every part, m."""
-        if self.poses is None:
+        if self.tips is None:
             return [self.geometry.points(own.q, theta) for own in self.parts]
         tool = self.geometry.tool + theta[self.geometry.slices["tool"]].view(-1, 3)
-        return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.poses]
+        return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.tips]
 
     def by_errors(self, theta: Tensor, root: Tensor) -> list[Tensor]:
         """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u; with known poses of the only marker."""
-        if self.poses is None:
+        if self.tips is None:
             return [self.geometry.sensitivities(own.q, theta) @ root for own in self.parts]
-        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]] for T in self.poses]
+        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]] for T in self.tips]
 
     def split(self, shifts: Tensor) -> tuple[Tensor, ...]:
         """Shifts of every part."""
@@ -328,7 +328,7 @@ def weighed_fits(solved: Callable[[Tensor], Fit], start: tuple[float, Tails]) ->
         squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
         total = float((tails.weights * squares).nansum())
         before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), LIMITS.smallest_noise_m)
-        dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in fit.errors]).long()
+        dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in fit.errors])
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, dim)
         if abs(level - before) < LIMITS.noise_change * level:
             break

@@ -166,7 +166,9 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         A = R - _means(R, socket, weights)[socket]
         b = t - _means(t, socket, weights)[socket]
         root = weights.sqrt()
-        ball = _determined_part((root[:, None, None] * A).flatten(0, 1), -(root[:, None] * b).flatten())
+        U, s, Vt = torch.linalg.svd((root[:, None, None] * A).flatten(0, 1), full_matrices=False)
+        kept = s > UNDETERMINED_MOTION_M * (3 * len(A)) ** 0.5  # directions that the rows leave open stay at the tip
+        ball = Vt[kept].mT @ ((U[:, kept].mT @ -(root[:, None] * b).flatten()) / s[kept])
         distances = (A @ ball + b).norm(dim=1)
         before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
@@ -192,13 +194,6 @@ def _means(values: Tensor, socket: Tensor, weights: Tensor) -> Tensor:
     shape = (-1, *[1] * (values.ndim - 1))
     total = values.new_zeros(count, *values.shape[1:]).index_add(0, socket, values * weights.view(shape))
     return total / weights.new_zeros(count).index_add(0, socket, weights).view(shape)
-
-
-def _determined_part(A: Tensor, b: Tensor) -> Tensor:
-    """The smallest x that minimises |A x - b|: directions that the rows leave open stay at the tip."""
-    U, s, Vt = torch.linalg.svd(A, full_matrices=False)
-    kept = s > UNDETERMINED_MOTION_M * len(A) ** 0.5
-    return Vt[kept].mT @ ((U[:, kept].mT @ b) / s[kept])
 
 
 def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int) -> Identification:
@@ -325,13 +320,6 @@ def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, T
     return _registered_by(robot, data, inliers, on), inliers
 
 
-def with_large_offsets(data: Measurements, registration: Identification, inliers: Tensor) -> Identification:
-    """The registration, with joint offsets if these explain far more; then with a warning."""
-    if float(distances(registration.geometry, data).nanmedian()) > ROBUST.examined_residual * spread(data.points):
-        return _with_offsets(registration, data, inliers)
-    return registration
-
-
 def distances(geometry: Geometry, data: Measurements) -> Tensor:
     """From predicted to measured markers, (N, P) in m; NaN where they are hidden."""
     return (geometry.points(data.q) - data.points).norm(dim=-1)
@@ -339,8 +327,7 @@ def distances(geometry: Geometry, data: Measurements) -> Tensor:
 
 def largest_distances(geometry: Geometry, data: Measurements) -> Tensor:
     """The largest distance of each row from predicted to measured markers, (N,) in m."""
-    each = distances(geometry, data)
-    return largest_known(each)
+    return largest_known(distances(geometry, data))
 
 
 def spread(points: Tensor) -> float:
@@ -362,16 +349,16 @@ def _registered_by(robot: Tree | Geometry, data: Measurements, inliers: Tensor, 
     return registration
 
 
-def _with_offsets(registration: Identification, data: Measurements, inliers: Tensor) -> Identification:
-    """The registration with joint offsets, if these explain far more; then with a warning."""
-    geometry = registration.geometry
-    chain = geometry.chain
-    if len(data) < 2 * (2 + chain.n):
+def with_large_offsets(data: Measurements, registration: Identification, inliers: Tensor) -> Identification:
+    """The registration, with joint offsets if these explain far more; then with a warning."""
+    geometry, before = registration.geometry, float(distances(registration.geometry, data).nanmedian())
+    chain, size = geometry.chain, spread(data.points)
+    if before <= ROBUST.examined_residual * size or len(data) < 2 * (2 + chain.n):
         return registration
     offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
     again = _registered_by(with_joint_offsets(geometry, offsets), data, inliers, geometry.on)
-    after, before = (float(distances(r.geometry, data).nanmedian()) for r in (again, registration))
-    explained = after <= min(ROBUST.remaining * before, ROBUST.accepted_residual * spread(data.points))
+    after = float(distances(again.geometry, data).nanmedian())
+    explained = after <= min(ROBUST.remaining * before, ROBUST.accepted_residual * size)
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
     if not explained or bool((turned.abs() > ROBUST.largest_offset_rad).any()):
         return registration

@@ -196,7 +196,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     nothing, tails = torch.zeros_like(rough.covariance), Tails.none(sum(map(len, tables)), 1)
     status = "ball and devices found."
     registration = Identification(start, rms, rms, nothing, 0, status, nothing[0], Prior(), tails)
-    rows = Rows(start, _moved(rows, rough.shifts), rows.poses if rigid else None)
+    rows = Rows(start, _moved(rows, rough.shifts), rows.tips if rigid else None)
     return _estimate(rows, still if rigid else root, registration)
 
 

@@ -66,61 +66,6 @@ ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 
 
-@dataclass(frozen=True, eq=False)
-class SocketPlaces:
-    """Where sockets are in the measuring frame, before the exact fit.
-
-    Args:
-        sockets: their names and known distances.
-        positions: (S, 3) most probable places, m.
-        root: (3 S, 3 S) square root of the covariance of the places, m.
-    """
-
-    sockets: Sockets
-    positions: Tensor
-    root: Tensor
-
-    @classmethod
-    def around(cls, sockets: Sockets, positions: Tensor) -> SocketPlaces:
-        """Wide around positions (S, 3), and with the known distances linearised there [m]."""
-        eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision = eye / PLACES.found_m_rad**2
-        push = torch.zeros_like(positions).flatten()
-        for known in sockets.blocks:
-            U = positions.new_zeros(len(known), *positions.shape)
-            errors = positions.new_zeros(len(known))
-            for number, (first, second, length) in enumerate(known):
-                away = positions[second] - positions[first]
-                U[number, second] = away / away.norm()
-                U[number, first] = -U[number, second]
-                errors[number] = length - float(away.norm())
-            U = U.flatten(1)
-            own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
-            weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
-            precision = precision + weighed @ U
-            push = push + weighed @ errors
-        factor = torch.linalg.cholesky(precision)
-        root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
-        return cls(sockets, positions + (root @ (root.mT @ push)).view(-1, 3), root)
-
-    def shared(self, socket: Tensor, coordinates: int) -> Tensor:
-        """Uncertainty of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m.
-
-        Args:
-            socket: (N,) number of each row's socket, -1 for none. coordinates: 3 P.
-        """
-        rows, own = socket != NO_SOCKET, self.root.view(len(self.positions), 3, -1)
-        effects = own.new_zeros(len(socket), coordinates, own.shape[2])
-        effects[rows, -3:] = own[socket[rows]]
-        return effects
-
-    def placed(self, data: Measurements) -> Measurements:
-        """The rows with the places of their sockets as measured positions of the ball."""
-        rows, points = _resting(data), data.points.clone()
-        points[rows, -1] = self.positions[data.socket_numbers[rows]]
-        return with_attributes(data, points=points)
-
-
 @dataclass(frozen=True)
 class PlaceErrors:
     """A place as predicted by the model without its rows, scales kept.
@@ -142,7 +87,9 @@ class SocketDevices(DeviceSet):
     """The sockets of a calibration, in the measuring frame: that of the device, or the robot's base without one.
 
     Args:
-        places: where they are.
+        sockets: their names and known distances.
+        positions: (S, 3) most probable places, m. root: (3 S, 3 S) square root of the covariance of these before the
+            fit, m.
         socket: (N,) number of the socket of each row of the calibration, -1 for rows of none.
         by_device: whether a device measured other rows.
         covariance: (3 S, 3 S) of the positions, m^2; without a device without rigid motions of all of them. None before
@@ -152,7 +99,9 @@ class SocketDevices(DeviceSet):
             the true ones over the joint ranges of the rows; without a device after the best rigid motion.
     """
 
-    places: SocketPlaces
+    sockets: Sockets
+    positions: Tensor
+    root: Tensor
     socket: Tensor
     by_device: bool = False
     covariance: Tensor | None = None
@@ -160,14 +109,31 @@ class SocketDevices(DeviceSet):
     workspace_deviation: float = 0.0
 
     @classmethod
-    def of_rows(cls, places: SocketPlaces, table: Measurements, rows: Tensor, count: int) -> SocketDevices:
-        """The sockets of a table whose rows (M,) are some of the ``count`` rows of a calibration."""
-        socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        socket[rows] = table.socket_numbers
-        return cls(places, socket, not table.without_device)
+    def around(cls, data: Measurements, positions: Tensor) -> SocketDevices:
+        """The sockets of a table, wide around positions (S, 3), and with the known distances linearised there [m]."""
+        eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
+        precision, sockets = eye / PLACES.found_m_rad**2, data.known_sockets
+        push = torch.zeros_like(positions).flatten()
+        for known in sockets.blocks:
+            U = positions.new_zeros(len(known), *positions.shape)
+            errors = positions.new_zeros(len(known))
+            for number, (first, second, length) in enumerate(known):
+                away = positions[second] - positions[first]
+                U[number, second] = away / away.norm()
+                U[number, first] = -U[number, second]
+                errors[number] = length - float(away.norm())
+            U = U.flatten(1)
+            own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
+            weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
+            precision = precision + weighed @ U
+            push = push + weighed @ errors
+        factor = torch.linalg.cholesky(precision)
+        root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
+        places = positions + (root @ (root.mT @ push)).view(-1, 3)
+        return cls(sockets, places, root, data.socket_numbers, not data.without_device)
 
     @classmethod
-    def around(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
+    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
         """The sockets around a model that is known, and their rows placed there; nothing without sockets.
 
         Args:
@@ -175,14 +141,30 @@ class SocketDevices(DeviceSet):
         """
         if table.sockets is None:
             return [], table
-        socket, resting = table.socket_numbers, _resting(table)
-        places = SocketPlaces.around(table.sockets, socket_means(seen[rows][resting, -3:], socket[resting]))
-        table = places.placed(table)
-        return [cls.of_rows(places, table, rows, len(seen))], table
+        socket = table.socket_numbers
+        resting = socket != NO_SOCKET
+        found = cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting]))
+        return [found.of_rows(rows, len(seen))], found.at_places(table)
+
+    def of_rows(self, rows: Tensor, count: int) -> SocketDevices:
+        """The same for ``count`` rows of a calibration, of which these (M,) are the rows here."""
+        socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        socket[rows] = self.socket
+        return replace(self, socket=socket)
+
+    def shared(self, coordinates: int) -> Tensor:
+        """Uncertainty of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m."""
+        rows, own = self.socket != NO_SOCKET, self.root.view(len(self.positions), 3, -1)
+        effects = own.new_zeros(len(self.socket), coordinates, own.shape[2])
+        effects[rows, -3:] = own[self.socket[rows]]
+        return effects
 
     def at_places(self, table: Measurements) -> Measurements:
-        """See :class:`DeviceSet`."""
-        return self.places.placed(self.named(table))
+        """See :class:`DeviceSet`: the places of their sockets as measured positions of the ball."""
+        table = self.named(table)
+        rows, points = table.socket_numbers != NO_SOCKET, table.points.clone()
+        points[rows, -1] = self.positions[table.socket_numbers[rows]]
+        return with_attributes(table, points=points)
 
     def places_at(self, row: int) -> Tensor | None:
         """See :class:`DeviceSet`: all sockets."""
@@ -201,27 +183,22 @@ class SocketDevices(DeviceSet):
         if places is None:
             return like
         nearest = torch.cdist(points[:, -1], places.to(points)).argmin(1)
-        return with_attributes(like, socket=nearest, sockets=self.places.sockets)
+        return with_attributes(like, socket=nearest, sockets=self.sockets)
 
     @property
     def names(self) -> tuple[str, ...]:
         """S names."""
-        return self.places.sockets.names
-
-    @property
-    def positions(self) -> Tensor:
-        """(S, 3) m."""
-        return self.places.positions
+        return self.sockets.names
 
     @property
     def size(self) -> int:
         """Three of each socket."""
-        return self.places.root.shape[1]
+        return self.root.shape[1]
 
     def doubts(self, data: Seen) -> Iterator[Cause]:
         """See :class:`DeviceSet`: the known distances, the same at all places."""
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
-        for block in self.places.sockets.blocks:
+        for block in self.sockets.blocks:
             effects = data.points.new_zeros(*data.points.shape, 1)
             for first, second, _ in block:
                 along = self.positions[second] - self.positions[first]
@@ -236,18 +213,18 @@ class SocketDevices(DeviceSet):
 
     def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
-        effects = self.places.shared(self.socket, data.points.shape[1])
+        effects = self.shared(data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
 
     def settled(self, found: Settled) -> SocketDevices:
         """See :class:`DeviceSet`."""
-        root, positions = self.places.root, self.positions - (self.places.root @ found.shifts).view(-1, 3)
+        root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         return replace(
             self,
-            places=replace(self.places, positions=positions),
+            positions=positions,
             covariance=root @ found.covariance @ root.mT,
             left_out=() if found.chosen is None else self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
@@ -268,14 +245,14 @@ class SocketDevices(DeviceSet):
             raise MeasurementError.of("rows in sockets", expected=few(self.names), got=few(unknown))
         numbers = {name: number for number, name in enumerate(self.names)} | {"": NO_SOCKET}
         own = torch.tensor([numbers[name] for name in table.row_sockets], dtype=torch.int64, device=HOST)
-        return with_attributes(table, socket=own, sockets=self.places.sockets)
+        return with_attributes(table, socket=own, sockets=self.sockets)
 
     def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
         """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.
 
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
-        data, sockets, found = chosen.data, self.places.sockets, []
+        data, sockets, found = chosen.data, self.sockets, []
         numbers, process = data.numbers, data.process(chosen.selection.scales)
         shared = numbers.S[:, data.sensitivities.shape[2] :]
         place = torch.where(self.socket == NO_SOCKET, NO_SOCKET, sockets.place[self.socket])
@@ -292,14 +269,14 @@ class SocketDevices(DeviceSet):
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
-        place = self.places.sockets.place
+        place = self.sockets.place
         if model.map.workspace is not None:
             warn_of_flat_places(model.map, self.positions, self.socket, place, self.workspace_deviation)
 
     @property
     def deviations(self) -> Tensor:
         """(S, 3) standard deviations of the coordinates, m."""
-        known = torch.zeros_like(self.places.root) if self.covariance is None else self.covariance
+        known = torch.zeros_like(self.root) if self.covariance is None else self.covariance
         return known.diagonal().clamp(min=0).sqrt().view(-1, 3)
 
     @property
@@ -356,7 +333,7 @@ def coordinate_stages(
     progress("registration", 0, 1)
     if own.table.sockets is not None:
         places, table, stages = stages_by_sockets(robot, own.table)
-        return [SocketDevices.of_rows(places, table, own.rows, count)], table, stages
+        return [places.of_rows(own.rows, count)], table, stages
     registration = registered(robot, own.table)
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, own.table.q, own.table.points)
@@ -366,7 +343,7 @@ def coordinate_stages(
 
 def stages_by_sockets(
     robot: Tree, data: Measurements
-) -> tuple[SocketPlaces, Measurements, tuple[Identification, Identification]]:
+) -> tuple[SocketDevices, Measurements, tuple[Identification, Identification]]:
     """Where the sockets are, the rows placed there, and registration and geometric calibration.
 
     Raises:
@@ -397,7 +374,7 @@ def stages_by_sockets(
         check_identification(device, replace(identification, geometry=seen))
         warn_of_other_robot(robot, device, start, found)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
-    return places, places.placed(data), (registration, identification)
+    return places, places.at_places(data), (registration, identification)
 
 
 def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
@@ -415,7 +392,7 @@ def _ball(geometry: Geometry, data: Measurements) -> Tensor:
 
 def geometry_by_sockets(
     data: Measurements, positions: Tensor, registration: Identification
-) -> tuple[Identification, SocketPlaces]:
+) -> tuple[Identification, SocketDevices]:
     """Geometric calibration, and the places of the sockets around it.
 
     Args:
@@ -423,19 +400,12 @@ def geometry_by_sockets(
     """
     geometry, resting = registration.geometry, data.socket_rows()
     held = held_parameters(geometry) if data.without_device else ()
-    places = SocketPlaces.around(data.known_sockets, positions)
+    places = SocketDevices.around(data, positions)
     for _ in range(ROUNDS):
-        placed, shared = places.placed(data), places.shared(data.socket_numbers, 3 * data.markers).unflatten(1, (-1, 3))
+        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
         found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
-        places = SocketPlaces.around(
-            data.known_sockets, socket_means(_ball(found.geometry, resting), resting.socket_numbers)
-        )
+        places = SocketDevices.around(data, socket_means(_ball(found.geometry, resting), resting.socket_numbers))
     return found, places
-
-
-def _resting(data: Measurements) -> Tensor:
-    """(N,) boolean: the rows whose ball rested in a socket."""
-    return data.socket_numbers != NO_SOCKET
 
 
 def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:

@@ -379,7 +379,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if new.covariance is not None:
         turn = torch.block_diag(*[T[:3, :3]] * new.markers)
         noise = larger(noise, turn.mT @ new.covariance @ turn)
-    sets, table = SocketDevices.around(table, rows, seen)
+    sets, table = SocketDevices.around_model(table, rows, seen)
     y = table.points.flatten(1)
     sensor = replace(NoiseModel.of(table, 0.0), known=None)
     if sensor.visible is not None:
