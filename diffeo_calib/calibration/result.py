@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places, sensor_key
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import with_positions
 
 STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
@@ -126,7 +126,7 @@ class CalibrationResult:
     def places(self, stage: str = STAGES[-1]) -> Places:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
         devices = self.placed.devices_by_stage[STAGES.index(stage)]
-        by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
+        by_key = {own.data.column_kind: found for own, found in zip(self.readings, devices, strict=True)}
         return Places(self.placement, by_key, self.placed.ball)
 
     @property

@@ -28,7 +28,7 @@ from diffeo_calib.sensors.coordinates import Beside, check_shown, sensor_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places, sensor_key
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -212,7 +212,7 @@ def impossible_errors(model: CalibratedKinematics, places: Places, data: Any, fo
         MeasurementError: something has moved, which explains them.
     """
     for table, _ in divided(data)[1]:
-        devices = places.devices[sensor_key(table)]
+        devices = places.devices[table.column_kind]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
         if implausibly_far(model, float(away.median())):
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"

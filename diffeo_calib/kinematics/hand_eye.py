@@ -151,17 +151,18 @@ class SetUp(NamedTuple):
     Args:
         transform: (4, 4) from the model's measuring frame to its own, m. mount: (4, 4) from what it had on the tool to
             that of the model, m.
+        framed: whether the measuring frame was moved, not what is on the tool.
         columns: (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's.
-        frame_twists: (6, k) shift and turn of the measuring frame about the model's origin, m and rad, by each of them;
-            mount_twists: (6, k) of what is on the tool, along the axes of the model's tool.
-        mount_std: (6,) deviations of the same where no row of the fit tells of them.
+        twists: (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or
+            of what is on the tool along the axes of the model's tool.
+        mount_std: (6,) deviations of what is on the tool where no row of the fit tells of them.
     """
 
     transform: Tensor
     mount: Tensor
+    framed: bool = False
     columns: Tensor | None = None
-    frame_twists: Tensor | None = None
-    mount_twists: Tensor | None = None
+    twists: Tensor | None = None
     mount_std: Tensor | None = None
 
     @classmethod
@@ -177,13 +178,17 @@ class SetUp(NamedTuple):
         if bool((transform == eye).all()):
             return here
         framed = own.kind == SESSION
-        found = here._replace(**{"transform" if framed else "mount": transform})
-        columns, twists = found._shifts(model, rows, framed=framed)
+        found = here._replace(framed=framed, **{"transform" if framed else "mount": transform})
+        columns, twists = found._shifts(model, rows)
         if not framed and not bool(columns.any()):
             return found._replace(mount_std=own.deviations[number])
-        return found._replace(columns=columns, **{"frame_twists" if framed else "mount_twists": twists})
+        return found._replace(columns=columns, twists=twists)
 
-    def _shifts(self, model: CalibratedKinematics, rows: Tensor, *, framed: bool) -> tuple[Tensor, Tensor]:
+    def _slopes(self, points: Tensor) -> Tensor:
+        """(M, 9, 6) of points (M, 3, 3), m, by the twists."""
+        return frame_slopes(points, points.new_zeros(3)) if self.framed else own_slopes(points)
+
+    def _shifts(self, model: CalibratedKinematics, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Which shifts (c,) of the fit these rows share alone and are rigid motions, and the twists (6, k) of these."""
         fitted = model.map
         shared, points = fitted.noise.shared, fitted.fitted_points.unflatten(1, (-1, 3))
@@ -193,12 +198,12 @@ class SetUp(NamedTuple):
         if not bool(columns.any()):
             return columns, shared.new_zeros(NUMBERS_OF_A_FRAME, 0)
         effects = shared[rows][..., columns].flatten(0, 1)
-        slopes = (frame_slopes(points[rows], points.new_zeros(3)) if framed else own_slopes(points[rows])).flatten(0, 1)
+        slopes = self._slopes(points[rows]).flatten(0, 1)
         twists = torch.linalg.lstsq(slopes, effects, driver="gelsd").solution
         left = (effects - slopes @ twists).norm(dim=0)
         rigid = left < RIGID_MOTION_SHARE * effects.norm(dim=0)
         columns[columns.clone()] = rigid
-        if int(rigid.sum()) != NUMBERS_OF_A_FRAME and (framed or bool(rigid.any())):
+        if int(rigid.sum()) != NUMBERS_OF_A_FRAME and (self.framed or bool(rigid.any())):
             what = "the hand-eye transform of one of several cameras"
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
         return columns, twists[:, rigid]
@@ -209,24 +214,22 @@ class SetUp(NamedTuple):
 
     def shifted(self, points: Tensor) -> Tensor:
         """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
-        places, found = points.unflatten(1, (-1, 3)), points.new_zeros(*points.shape, 0)
-        if self.frame_twists is not None:
-            found = frame_slopes(places, points.new_zeros(3)) @ self.frame_twists
-        return found if self.mount_twists is None else own_slopes(places) @ self.mount_twists
+        none = points.new_zeros(*points.shape, 0)
+        return none if self.twists is None else self._slopes(points.unflatten(1, (-1, 3))) @ self.twists
 
     def seen_from(self, base: Tensor) -> Shifts:
         """The twists of a base (4, 4) about its origin and along its axes by the shifts; none for the model's frame."""
-        if self.columns is None or self.frame_twists is None:
+        if self.columns is None or self.twists is None or not self.framed:
             return None
-        shift, turn = self.frame_twists.split(3)
+        shift, turn = self.twists.split(3)
         there = shift + torch.linalg.cross(turn, base[:3, 3:].expand_as(turn), dim=0)
         return self.columns, torch.cat([base[:3, :3].mT @ there, base[:3, :3].mT @ turn])
 
     def on_tool(self, tool: Tensor) -> Shifts:
         """What the shifts do to points (3, 3) of a frame on the tool, m; none for the model's tool."""
-        if self.columns is None or self.mount_twists is None:
+        if self.columns is None or self.twists is None or self.framed:
             return None
-        return self.columns, own_slopes(tool[None])[0] @ self.mount_twists
+        return self.columns, self._slopes(tool[None])[0] @ self.twists
 
 
 Shifts = tuple[Tensor, Tensor] | None

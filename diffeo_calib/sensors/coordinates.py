@@ -28,7 +28,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, SOCKET, PlacedDevices, Places, placed, sensor_key
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, SOCKET, PlacedDevices, Places, placed
 from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates
 
@@ -276,7 +276,7 @@ class OtherDevices(Sensor):
         """Devices that are not known."""
         known = beside.devices.get(data.kind)
         if known is not None and set(data.names) <= set(known.names):
-            return Places(devices={sensor_key(data): known})
+            return Places(devices={data.column_kind: known})
         names = tuple(name for name in data.names if known is None or name not in known.names)
         new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
         rows = data.rows(new[data.device])
@@ -287,11 +287,11 @@ class OtherDevices(Sensor):
         names = few([f"'{name}'" for name in names])
         sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
         numbers = free * int(new.sum())
-        return Places(devices={sensor_key(data): devices}, found=(sentence,), numbers=numbers)
+        return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=numbers)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
         """In the unit of the device."""
-        devices = places.devices.get(sensor_key(data))
+        devices = places.devices.get(data.column_kind)
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)

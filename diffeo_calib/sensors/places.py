@@ -34,7 +34,7 @@ class Places:
 
     Args:
         frames: of the set-ups of measured positions; None where these are in the frame of the model.
-        devices: those of readings, see :func:`sensor_key`.
+        devices: those of readings, see :attr:`Readings.column_kind`.
         ball: whether the last marker is a ball that no device of positions measures.
         found: what was found from the rows that are judged, in sentences. numbers: how many numbers that took.
     """
@@ -60,11 +60,6 @@ LARGEST_SHARE = 0.5
 """Median residual of readings of the rows that are judged, relative to the RMS distance of what they see from its
 middle: wrong rows or units, not a robot that errs."""
 CHECK_READINGS = "check the columns of the readings, their unit, and which device each row names"
-
-
-def sensor_key(data: Readings) -> object:
-    """What readings of the same kind of devices have in common."""
-    return data.column_kind
 
 
 def fitting_devices(data: Readings, points: Tensor) -> Devices:

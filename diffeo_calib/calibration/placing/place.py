@@ -26,7 +26,6 @@ from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
-    devices_around,
     identify_readings,
     reading_sets,
     with_ball_of,
@@ -49,7 +48,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
 
@@ -81,6 +80,7 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
     y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
     known = q.new_zeros(N, bodies * size, bodies * size)
     kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
+    first, modes = 0, None
     if own is not None:
         rows, m = own.rows, own.y.shape[1]
         parts.append(coordinates_of(rows, m, q))
@@ -89,9 +89,10 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
             known[rows] = own.noise_model.known
         if own.noise_model.kinds is not None:
             kinds[rows] = own.noise_model.kinds
-    first, modes = 0, None
-    if own is not None:
-        first, modes = own.noise_model.kind_count, _of_rows(own.noise_model.modes, own.rows, N)
+        first, each = own.noise_model.kind_count, own.noise_model.modes
+        if each is not None:
+            modes = each.new_zeros(N, *each.shape[1:])
+            modes[rows] = each
     every = torch.arange(dim, device=q.device)
     for kind, one in enumerate(readings, first):
         place, seen = (one.rows[:, None], one.numbers), every[-3 * one.devices.seen_points :]
@@ -119,15 +120,6 @@ def coordinates_of(rows: Tensor, m: int, like: Tensor) -> Part:
     """Rows (M,) that report the first m coordinates as their first m numbers."""
     eye, whole = torch.eye(m, dtype=like.dtype, device=like.device), torch.arange(m, device=like.device)
     return Part(rows, whole, whole, LinearFunctionals(eye.expand(len(rows), m, m), like.new_zeros(len(rows), m)))
-
-
-def _of_rows(values: Tensor | None, rows: Tensor, count: int) -> Tensor | None:
-    """Values (M, ...) of some rows as those of all, zero elsewhere: (N, ...)."""
-    if values is None:
-        return None
-    found = values.new_zeros(count, *values.shape[1:])
-    found[rows] = values
-    return found
 
 
 LOG = logging.getLogger(__name__)
@@ -357,7 +349,7 @@ def _by_coordinates(
     warn_of_open_directions(robot, table, stages[0])
     tables = [one.table for one in readings]
     stages = with_ball_of(tables, table, stages)
-    at = [devices_around(stage.geometry, tables) for stage in stages]
+    at = [tuple(fitting_devices(own, stage.geometry.points(own.q)) for own in tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
     cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
     placement = Placement((*sessions, *sockets, *cameras, *sets))

@@ -37,7 +37,7 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices, fitting_devices, sensor_key
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
@@ -114,7 +114,7 @@ class ReadingDevices(DeviceSet):
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         """See :class:`DeviceSet`."""
-        own = next(one for one in other.readings if sensor_key(one.table) == sensor_key(self.data))
+        own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
         self.devices.numbers(own.table)  # refuses other devices
         return replace(self, data=own.table, rows=own.rows)
 
@@ -225,11 +225,6 @@ def with_ball_of(
     bare = geometry.with_tool(geometry.tool[:1] * 0.0, geometry.on[-1:] if tip is None else (tip,))
     ball = identify_readings(bare, readings, rigid=True).identification
     return stages[0].with_ball(ball), stages[1].with_ball(ball)
-
-
-def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devices, ...]:
-    """The devices of readings around a robot, for each table."""
-    return tuple(fitting_devices(own, geometry.points(own.q)) for own in tables)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
