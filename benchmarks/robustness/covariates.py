@@ -47,9 +47,9 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.process.scales import COUPLED_PROFILE
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 FORMS = tuple(f"{part}, {shape}" for part in ("frame", "joints", "field") for shape in ("linear", "smooth"))
 SMOOTH_RANGE = 0.3

@@ -32,8 +32,8 @@ from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 MOST_COORDINATES = 4500

@@ -72,11 +72,3 @@ def largest_known(values: Tensor, dim: int = 1) -> Tensor:
 def known(values: Tensor) -> Tensor:
     """The values that are not NaN, in one row."""
     return values[~values.isnan()]
-
-
-SMALLEST_MEDIAN_M = 1e-7
-
-
-def median_weights(distances: Tensor, half: float) -> Tensor:
-    """Weights (N,) of rows by their distances (N,), m, half at some medians: 1 / (1 + (d / (half median))^2)."""
-    return 1.0 / (1.0 + (distances / (half * distances.median().clamp(min=SMALLEST_MEDIAN_M))).square())

@@ -22,8 +22,8 @@ from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import frame_slopes, skew
-from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, own_slopes
+from diffeo_calib.robots.se3 import skew
+from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
 RIGID_MOTION_SHARE = 0.01
 """Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""

@@ -27,10 +27,10 @@ from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER, Program
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 LONGEST_TOOL = 1e3
 """m; beyond it the three points of a tool lose digits."""

@@ -81,12 +81,6 @@ def twist_transform(twists: Tensor) -> Tensor:
     return transforms(rotation(twists[..., 3:]), twists[..., :3])
 
 
-def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
-    """Derivatives of points by a shift and a small turn about a centre: (N, P, 3), (3,) -> (N, 3 P, 6)."""
-    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
-    return torch.cat([eye, -skew(points - centre)], dim=-1).flatten(1, 2)
-
-
 def nearest_rotations(matrices: Tensor) -> Tensor:
     """The proper rotations nearest in the Frobenius norm: any matrices (..., 3, 3) -> (..., 3, 3).
 

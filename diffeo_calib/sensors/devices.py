@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.common.quantiles import SMALLEST_MEDIAN_M, median_weights
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
@@ -30,6 +29,7 @@ ROUNDS = 20
 """Steps of a refinement."""
 OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
+SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
 FEWEST_PER_DEVICE = 8
 """Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
@@ -341,6 +341,11 @@ def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     scale = matrix.square().mean(0).sqrt().clamp(min=SMALLEST_M)
     found = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
     return found / scale
+
+
+def median_weights(distances: Tensor, half: float) -> Tensor:
+    """Weights (N,) of rows by their distances (N,), m, half at some medians: 1 / (1 + (d / (half median))^2)."""
+    return 1.0 / (1.0 + (distances / (half * distances.median().clamp(min=SMALLEST_MEDIAN_M))).square())
 
 
 def across(directions: Tensor) -> Tensor:

@@ -25,7 +25,6 @@ from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.robots.se3 import (
-    frame_slopes,
     nearest_rotations,
     skew,
     transforms,
@@ -401,6 +400,12 @@ def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
         away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
         inside = away <= GROSS_DISTANCES * away.nanmedian()
     return T
+
+
+def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
+    """Derivatives of points by a shift and a small turn about a centre: (N, P, 3), (3,) -> (N, 3 P, 6)."""
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
+    return torch.cat([eye, -skew(points - centre)], dim=-1).flatten(1, 2)
 
 
 def own_slopes(points: Tensor) -> Tensor:

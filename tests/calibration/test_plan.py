@@ -18,8 +18,8 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 MARKER = torch.tensor([[0.1, 0.0, 0.1]], dtype=torch.float64)
 

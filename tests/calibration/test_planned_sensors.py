@@ -19,7 +19,7 @@ from diffeo_calib.calibration.planning.sensors import DeviceReadings
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.se3 import frame_slopes
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 STEP = 1e-6

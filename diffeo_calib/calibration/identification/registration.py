@@ -37,7 +37,7 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.common.quantiles import known, largest_known, median_weights
+from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
@@ -45,6 +45,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, PLACES, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
+from diffeo_calib.sensors.devices import median_weights
 
 
 def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Identification:

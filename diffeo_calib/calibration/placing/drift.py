@@ -18,10 +18,10 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.known_drift import OFFSETS, KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""

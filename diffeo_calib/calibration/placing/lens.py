@@ -16,13 +16,12 @@ from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.cameras.seeing import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
-from diffeo_calib.common.quantiles import median_weights
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
-from diffeo_calib.sensors.devices import OUTLIER_MEDIANS
+from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, median_weights
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View
 

@@ -26,7 +26,6 @@ from diffeo_calib.fitting.result import Progress
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.places import PlacedDevices
@@ -36,6 +35,7 @@ from diffeo_calib.sensors.set_ups import (
     MountedMarkers,
     SetUps,
     View,
+    frame_slopes,
     sessions_of,
     set_up_kind,
 )

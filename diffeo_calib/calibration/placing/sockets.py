@@ -47,11 +47,10 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
-from diffeo_calib.sensors.set_ups import View
+from diffeo_calib.sensors.set_ups import View, frame_slopes
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")

@@ -49,8 +49,9 @@ from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Featu
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import frame_slopes, rigid
+from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import device_coordinates
 
 

@@ -20,9 +20,9 @@ from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class Scene(NamedTuple):

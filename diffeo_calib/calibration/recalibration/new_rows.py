@@ -33,10 +33,10 @@ from diffeo_calib.maps.observation import Observation
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import frame_slopes
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01

@@ -132,9 +132,8 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
     for entry in found.lines():
         metres = entry["unit"] == "mm"
         values = [entry[name] * (per_mm if metres else 1.0) for name in COLUMNS[5:9]]
-        unit = source.table.length if metres else entry["unit"]
         cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
-        yield [*cells, *values, unit]
+        yield [*cells, *values, source.table.length if metres else entry["unit"]]
 
 
 def _say_places(places: Places) -> None:

@@ -40,7 +40,8 @@ from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
-from diffeo_calib.robots.se3 import frame_slopes, rotation, transforms
+from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 MAX_STEPS = 100
 SETTLED = 1e-9

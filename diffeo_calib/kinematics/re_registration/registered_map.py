@@ -48,7 +48,8 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.robots.se3 import frame_slopes, nearest_rotations, skew, transforms
+from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 LARGE_EXCESS = 3.0
 """Residuals by this factor above the expected ones mean that something else has changed too."""
