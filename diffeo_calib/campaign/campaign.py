@@ -8,8 +8,8 @@ has changed among them shows a few rows later, and those that were taken in sinc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from math import inf
+from dataclasses import dataclass, replace
+from math import ceil, inf, log
 from threading import Thread
 from typing import Any
 
@@ -20,7 +20,6 @@ from diffeo_calib.calibration.calibrate import Table, calibrate, check_arguments
 from diffeo_calib.calibration.planning.candidates import candidates as drawn
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.campaign.model import CampaignModel
-from diffeo_calib.campaign.planned import Next, planned
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
@@ -42,6 +41,27 @@ CANDIDATES, TARGETS = 120, 40
 """Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
 SAME_POSE = 5e-3
 """Largest difference of a joint between a pose and its repeat, rad or m."""
+MOST_STEPS, MOST_ROWS = 60, 10_000
+"""Poses that a forecast chooses, beyond which the variance is extrapolated as a power of their number; most of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Next:
+    """Poses to measure next.
+
+    Args:
+        q: (count, n) rad or m: poses to measure again, then the most helpful first.
+        rows: numbers of these among the candidates.
+        expected: expected error over the target after 0, 1, ... of the best poses, m.
+        needed: rows until the expected error is below the goal; None without a goal, or if none is in sight.
+        again: rows whose poses are to be measured again.
+    """
+
+    q: Tensor
+    rows: list[int]
+    expected: list[float]
+    needed: int | None
+    again: Sequence[int] = ()
 
 
 @methods_outside_inference_mode
@@ -197,10 +217,13 @@ class Campaign:
         if goal is None and self.goal is not None and self._model is not None:
             goal = self.goal * self._model.expected_error / (self.error_limit or self._model.expected_error)
         again = [one.row for one in self.verdicts if one.again][:count]
-        found = None if self._model is None else planned(self._model, count, goal)
+        found = Next(self.candidates[:0], [], [], None)
+        if self._model is not None:
+            rows, expected = self._model.next(count if goal is None else max(count, MOST_STEPS))
+            needed = None if goal is None else _needed(expected, goal, self._model.count)
+            found = Next(self._model.asked[0][rows[:count]], rows[:count], expected, needed)
         if not again:
-            return found
-        found = found or Next(self.candidates[:0], [], [], None)
+            return None if self._model is None else found
         q = torch.cat([self.table.q[again], found.q])[:count]
         return replace(found, q=q, rows=found.rows[: count - len(again)], again=again)
 
@@ -325,3 +348,16 @@ class Campaign:
 
 def _joints(robot: Tree, values: object) -> Tensor:
     return robot.joint_values(values).detach()  # pyright: ignore[reportArgumentType]
+
+
+def _needed(expected: list[float], goal: float, count: int) -> int | None:
+    """Rows until the expected error is below a goal, extrapolated by the last half of the steps."""
+    found = next((step for step, value in enumerate(expected) if value <= goal), None)
+    if found is not None or len(expected) < 3 or expected[-1] <= 0:
+        return found
+    half, last = len(expected) // 2, len(expected) - 1
+    power = log(expected[half] / expected[last]) / log((count + last) / (count + half))
+    if power <= 0:
+        return None
+    total = (count + last) * (expected[-1] / goal) ** (1 / power)
+    return ceil(total - count) if total < MOST_ROWS else None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from math import inf, pi
+from math import inf, isinf, pi
 from typing import Any, NamedTuple
 
 import torch
@@ -18,11 +18,10 @@ from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few, 
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
-from diffeo_calib.calibration.scales.selection import defaults
+from diffeo_calib.calibration.planning.knowledge import greedy
+from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.certainty import limit_of, scales_deviation
-from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
-from diffeo_calib.campaign.verdicts import LIMITS, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import LIMITS, Seen, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
@@ -30,6 +29,8 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -38,6 +39,10 @@ from diffeo_calib.sensors.tables import rows_of_one_kind
 
 MOST_COORDINATES = 4500
 """Measured numbers of a posterior: of more rows a random sample stands for all."""
+EXCEEDANCE_PROBABILITY = 0.05
+"""Probability that the true error is above its limit."""
+INFORMATION_COORDINATES, LOG_SCALE_STEP = 450, 0.2
+"""Measured numbers of random rows that say how certain scales are; step of a log scale between which they change."""
 UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: m as mm?"))
 
 
@@ -51,7 +56,7 @@ class Around(NamedTuple):
     def causes(self) -> list[Cause]:
         """Changes of robot, tool and devices that are tested."""
         devices = [one._replace(effects=one.effects[self.index]) for one in self.devices()]
-        return [one for one in (*causes_of(self.data), *devices) if bool((one.effects != 0).any())]
+        return [one.told_by(self.data) for one in (*causes_of(self.data), *devices) if bool((one.effects != 0).any())]
 
 
 @dataclass(eq=False)
@@ -63,9 +68,11 @@ class CampaignModel:
         selected: accepted rows that the scales were selected with. count: those of this model.
         deviation: of the log expected error by uncertain scales; infinite where they are not selected.
         seen: rows of the campaign at that time. asked: candidates (M, n) and target (T, n), rad or m.
-        posterior: of the accepted rows but the last ones. window: numbers of the last rows.
-        last: these, as the posterior predicts them. taken: (W,) boolean: those that were accepted.
-        compared: see :func:`_compared`. ratios: of accepted rows, see :attr:`typical`.
+        process: what is known by the accepted rows but the last ones. window: numbers of the last rows.
+        last: these around the places of the model. taken: (W,) boolean: those that were accepted.
+        target, options: the target, and the candidates, as the process expected them at some time.
+        compared: (T r, T r) what of the errors over the target counts.
+        noise: (M, r, r) of the candidates, m^2. ratios: of accepted rows, see :attr:`typical`.
         open: (M,) boolean, candidates that can be measured.
     """
 
@@ -77,11 +84,14 @@ class CampaignModel:
     count: int
     seen: int
     asked: tuple[Tensor, Tensor]
-    posterior: Posterior
+    process: Process
     window: list[int]
-    last: Seen
+    last: TangentData
     taken: Tensor
+    target: Expected
+    options: Expected
     compared: Tensor
+    noise: Tensor
     ratios: list[float]
     open: Tensor
 
@@ -126,11 +136,9 @@ class CampaignModel:
         found, data = chosen.selection.scales, chosen.data
         later: Any = None
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
-        made = cls(placed, data, found, *counts, asked, later, [], later, later, later, [], later).rebuilt(
-            table, verdicts
-        )
+        made = cls(placed, data, found, *counts, asked, later, [], *[later] * 6, [], later).rebuilt(table, verdicts)
         if certain and known is None:
-            made.deviation = scales_deviation(data, found, made.target, made.compared)
+            made.deviation = made.scales_deviation()
         return made
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
@@ -145,16 +153,19 @@ class CampaignModel:
         place_of = {row: number for number, row in enumerate(known)}
         mine = torch.tensor([place_of[row] for row in old if row in place_of], dtype=torch.int64, device=HOST)
         _, some = self.data.rows(mine).sample(len(mine), MOST_COORDINATES, 0)
-        rows = Rows.of(some, self.scales)
+        process = some.process(self.scales)
         later = [row for row in old if row not in place_of]
         if later:
-            rows = Rows.joined(rows, Rows.of(self.around(table, later).data, self.scales))
-        asked = self._asked(table)
-        posterior = Posterior(rows, asked)
-        last = posterior.see(Rows.of(self.around(table, window).data, self.scales))
-        taken = _flags([verdicts[row].accepted for row in window])
-        own = {"posterior": posterior, "window": window, "last": last, "taken": taken, "ratios": list(self.ratios)}
-        own |= {"compared": _compared(self.placed, asked[0]), "open": self.placed.sees(self.like, self.asked[0])}
+            process = process.given(*self._told(self.around(table, later).data))
+        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table, window).data}
+        own |= {"taken": _flags([verdicts[row].accepted for row in window]), "ratios": list(self.ratios)}
+        errors, own["compared"] = self._errors()
+        own["target"] = process.expected(errors)
+        candidates, row = self.asked[0], self.like
+        rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
+        like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
+        options, (own["noise"],) = self._told(self._around(like).data)
+        own |= {"options": process.expected(options), "open": self.placed.sees(self.like, candidates)}
         return replace(self, **own, seen=len(table))
 
     def check_placed(self) -> None:
@@ -193,17 +204,59 @@ class CampaignModel:
         """95 % quantile of the error over the target, m; infinite where it is not known."""
         return limit_of(self.expected_error, self._covariance, self.deviation)
 
+    def scales_deviation(self) -> float:
+        """Standard deviation of the log RMS error over the target by uncertain scales.
+
+        It is s with s^2 = g^T F^-1 g, g the gradient of the logarithm by the log scales, with the Fisher information of
+        the rows, whose covariance K has the derivatives K_i by log scales, and the prior,
+
+            F_ij = 1/2 tr(K^-1 K_i K^-1 K_j) + delta_ij / width^2.
+        """
+        _, some = self.data.sample(len(self.data.x), INFORMATION_COORDINATES, 0)
+        point, white, slopes = self.scales.logarithms(), list[Tensor](), list[float]()
+
+        def at(logarithms: Tensor) -> tuple[Tensor, float]:
+            """Covariance of the rows, and log RMS error over the target."""
+            process = some.process(scales := self.scales.from_logarithms(logarithms))
+            errors = self.compared @ process.expected(self.target.numbers).covariance
+            noise = some.numbers.blocks_of_table(some.told.weighted_noise(scales))
+            K = some.numbers.add_blocks(some.expected(scales).covariance, noise)
+            return K, 0.5 * float((errors * self.compared).sum().log())
+
+        low = torch.linalg.cholesky(at(point)[0])
+        for step in LOG_SCALE_STEP * torch.eye(len(point), dtype=point.dtype, device=point.device):
+            (K, value), (K_before, value_before) = at(point + step), at(point - step)
+            half = torch.linalg.solve_triangular(low, (K - K_before) / (2 * LOG_SCALE_STEP), upper=False)
+            white.append(torch.linalg.solve_triangular(low, half.T, upper=False).flatten())
+            slopes.append((value - value_before) / (2 * LOG_SCALE_STEP))
+        W, g = torch.stack(white), torch.tensor(slopes, dtype=point.dtype, device=point.device)
+        F = 0.5 * W @ W.T + torch.eye(len(g), dtype=W.dtype, device=W.device) / SCALE_PRIOR.growth**2
+        return float(g @ torch.linalg.solve(F, g)) ** 0.5
+
     @property
     def _covariance(self) -> Tensor:
         """Covariance (T r, T r) of the errors over the target, m^2."""
-        J = self.compared
-        return J @ self.known(J.shape[1]) @ J.T
+        self.target = self.process.expected(self.target.numbers, self.target)
+        return self.compared @ self.known(self.target, self.target) @ self.compared
 
-    def known(self, size: int | None = None) -> Tensor:
-        """Covariance of the target and then of the candidates by all accepted rows, the first ``size`` numbers, m^2."""
-        whole, mine = self.posterior.known[:size, :size], self.taken[self.last.rows.owner]
-        cross = self.last.asked[mine, :size]
-        return whole - cross.T @ torch.linalg.solve(self.last.covariance[mine][:, mine], cross)
+    def known(self, a: Expected, b: Expected) -> Tensor:
+        """Covariance (Ma, Mb) of places by all accepted rows, m^2."""
+        numbers, noise = self._told(self.last)
+        last, mine = self.process.expected(numbers), self.taken[numbers.owner]
+        by_a, by_b = (self.process.between(last, one)[mine] for one in (a, b))
+        K = numbers.add_blocks(last.covariance, noise)[mine][:, mine]
+        return self.process.between(a, b) - by_a.T @ torch.linalg.solve(K, by_b)
+
+    def next(self, count: int) -> tuple[list[int], list[float]]:
+        """Candidates that lower the variance over the target most, and the expected error before and after each, m."""
+        self.options = self.process.expected(self.options.numbers, self.options)
+        variance, cross = self._covariance.diagonal().mean(), self.compared @ self.known(self.target, self.options)
+        K, (M, r) = self.known(self.options, self.options), self.noise.shape[:2]
+        own, place = self.options.numbers.diagonal_blocks(K)[0] + self.noise, torch.arange(M, device=HOST)
+        how: Any = {"place": place, "open_": self.open, "count": min(count, int(self.open.sum()))}
+        found = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
+        lowered = torch.stack([variance, *(-by.square().sum() / len(cross) for by in found.lowered)]).cumsum(0)
+        return found.order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
         """Judge the last row of a table, add its verdict, and take in the row that leaves the window.
@@ -221,10 +274,7 @@ class CampaignModel:
         except DiffeoCalibError:
             self.window.pop()
             raise
-        last = len(self.window) - 1
-        seen = Seen.joined(
-            self.last, self._seen(around.data.rows(torch.tensor([last], dtype=torch.int64, device=HOST)))
-        )
+        last, seen = len(self.window) - 1, self._seen(*self._told(around.data))
         known = _flags([*(verdicts[number].accepted for number in self.window[:-1]), False])
         found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
         fits = found.fits(typical)
@@ -244,7 +294,7 @@ class CampaignModel:
                 if own.change is not None or not (before or own.cause or own.decided):
                     accepted = before and bool(own.fits)
                     verdicts[number] = replace(own, accepted=accepted, change=None if before else change)
-        self._move_on(seen, verdicts)
+        self._move_on(around.data, verdicts)
 
     @property
     def typical(self) -> float:
@@ -254,43 +304,39 @@ class CampaignModel:
             return LIMITS.at_first
         return max(1.0, last[int(LIMITS.typical_share * len(last))])
 
-    def _move_on(self, seen: Seen, verdicts: Sequence[Verdict]) -> None:
-        """Take the first row of a full window into the posterior, if it was accepted."""
+    def _move_on(self, data: TangentData, verdicts: Sequence[Verdict]) -> None:
+        """Take the first row of a full window into the process, if it was accepted."""
+        first, index = int(len(self.window) > LIMITS.window), torch.arange(len(self.window), device=HOST)
+        if first and verdicts[self.window[0]].accepted:
+            self.process = self.process.given(*self._told(data.rows(index[:1])))
+        self.window, self.last = self.window[first:], data.rows(index[first:])
         self.taken = _flags([verdicts[row].accepted for row in self.window])
-        self.last = seen
-        if len(self.window) <= LIMITS.window:
-            return
-        index = torch.arange(len(seen.rows), device=HOST)
-        row, self.last = seen.some(index[:1]), seen.some(index[1:])
-        if bool(self.taken[0]):
-            self.last = self.posterior.take(row, self.last)
-        self.window, self.taken = self.window[1:], self.taken[1:]
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
         row, last, freedom = self.window[-1], len(known) - 1, _freedom(data, len(known) - 1)
-        mine, visible = seen.rows.owner == last, data.visible[last]
+        numbers, mine = seen.numbers, seen.numbers.owner == last
 
         def fits(other: Seen, some: Tensor | None = None, freedom: int = freedom) -> bool:
             return measure(other, last, known, freedom, some).fits(self.typical, LIMITS.undone)
 
         y = data.y[last : last + 1]
         bodies = data.noise_model.bodies
-        undone = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
-        for words, other in [*undone, *exchanged(y, bodies)]:
-            error = seen.error.clone()
-            error[mine] += (other - y)[0, visible]
-            if fits(seen._replace(error=error)):
+        units = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
+        for words, other in [*units, *exchanged(y, bodies)]:
+            undone = torch.zeros_like(data.y)
+            undone[last:] = other - y
+            if fits(seen._replace(error=seen.error + numbers.of_table(data.in_numbers(undone)))):
                 return words
-        for words, other in self._other_joints(table, row, seen):
+        for words, other in self._other_joints(table, row, data):
             if fits(other):
                 return words
-        size = len(visible) // bodies
-        body = (seen.rows.visible.nonzero()[:, 1] // size).masked_fill(~mine, -1)
+        size = numbers.shape[1] // bodies
+        body = (numbers.cells % numbers.shape[1] // size).masked_fill(~mine, -1)
         good = [b for b in range(bodies) if fits(seen, mine & (body != b), freedom * (bodies - 1) // bodies)]
         return f"marker {good[0]} seems to be wrong" if len(good) == 1 < bodies else ""
 
-    def _other_joints(self, table: Any, row: int, seen: Seen) -> Iterator[tuple[str, Seen]]:
+    def _other_joints(self, table: Any, row: int, data: TangentData) -> Iterator[tuple[str, Seen]]:
         """The last rows with other joint values of the last one, in words."""
         turning = torch.tensor(self.placed.registration.geometry.chain.periodic, dtype=torch.bool, device=HOST)
         q = table.q[row]
@@ -299,14 +345,20 @@ class CampaignModel:
             "its joint values seem to be converted to radians twice": torch.where(turning, q * 180 / pi, q),
             "it seems to have been measured at the joint values of the row before": table.q[row - 1],
         }
-        before = seen.some(torch.arange(len(seen.rows) - 1, device=HOST))
-        each = self._seen(self.around(table, [row] * len(joints), torch.stack([*joints.values()])).data)
+        before, noise = self._told(data.rows(torch.arange(len(data.x) - 1, device=HOST)))
+        each = self.around(table, [row] * len(joints), torch.stack([*joints.values()])).data
         for number, text in enumerate(joints):
-            yield text, Seen.joined(before, each.some(torch.tensor([number], dtype=torch.int64, device=HOST)))
+            own, own_noise = self._told(each.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
+            yield text, self._seen(before.joined(own), [*noise, *own_noise])
 
-    def _seen(self, data: TangentData) -> Seen:
-        """Rows as the posterior predicts them."""
-        return self.posterior.see(Rows.of(data, self.scales))
+    def _told(self, data: TangentData) -> tuple[Numbers, list[Tensor]]:
+        """What rows tell, and the noise of every part."""
+        return data.numbers, data.numbers.blocks_of_table(data.told.weighted_noise(self.scales))
+
+    def _seen(self, numbers: Numbers, noise: Sequence[Tensor]) -> Seen:
+        """Rows as the process predicts them."""
+        at = self.process.expected(numbers)
+        return Seen(numbers, numbers.target - at.mean, numbers.add_blocks(at.covariance, noise))
 
     def around(self, table: Any, numbers: Sequence[int], joints: Tensor | None = None) -> Around:
         """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know.
@@ -330,21 +382,22 @@ class CampaignModel:
         index = torch.arange(len(anchors), len(whole), device=HOST)
         return Around(data.rows(index), lambda: placed.placement.changes(data), index)
 
-    def _asked(self, table: Any) -> tuple[Rows, Rows]:
-        """The target, and the candidates as if they were measured like the row :attr:`like`."""
-        candidates, row = self.asked[0], self.like
-        rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
-        like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
-        return self.target(self.scales), Rows.of(self._around(like).data, self.scales)
+    def _errors(self) -> tuple[Numbers, Tensor]:
+        """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.
 
-    def target(self, scales: Hyperparameters) -> Rows:
-        """The places at which the robot shall be accurate."""
-        q, nominal = self.asked[1], self.data.nominal.typical
-        at = replace(self.data, nominal=nominal, x=q, shared=None, observe=None, beside=None).linearisation(scales)
-        count, m = at.sensitivity.shape[:2]
-        c = 0 if self.data.shared is None else self.data.shared.shape[2]
-        nothing, seen = q.new_zeros(count, m), torch.ones(count, m, dtype=torch.bool, device=HOST)
-        return Rows(at, q.new_zeros(count, m, c), q.new_zeros(count, m, m), nothing, seen)
+        Without a measuring device rigid motions of all of them do not.
+        """
+        q, shifts = self.asked[1], 0 if self.data.shared is None else self.data.shared.shape[2]
+        at = replace(self.data, nominal=self.data.nominal.typical, x=q, shared=None, observe=None, beside=None)
+        A, points = bodies_of(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
+        nothing, S = points.new_zeros(len(q), len(A)), torch.nn.functional.pad(A @ at.sensitivities, (0, shifts))
+        own = {"target": nothing, "S": S, "J": A @ at.jacobian, "A": A.expand(len(q), *A.shape)}
+        numbers = Numbers.of(q, at.points, torch.ones_like(nothing, dtype=torch.bool), **own)
+        compared = torch.eye(nothing.numel(), dtype=S.dtype, device=S.device)
+        if self.placed.free:
+            B = (A @ frame_slopes(points, points.mean((0, 1)))).flatten(0, 1)
+            compared -= B @ torch.linalg.pinv(B)
+        return numbers, compared
 
 
 def with_joints(table: Any, q: Tensor) -> Any:
@@ -361,15 +414,16 @@ def _freedom(data: TangentData, row: int) -> int:
     return data.rows(torch.tensor([row], dtype=torch.int64, device=HOST)).measured_freedom
 
 
-def _compared(placed: Placed, target: Rows) -> Tensor:
-    """(T r, T 3 P) what of the errors over the target counts: the markers, or the origins of poses.
+def limit_of(error: float, covariance: Tensor, scales_deviation: float) -> float:
+    """The error that the true one exceeds with 5 % probability, m.
 
-    Without a measuring device rigid motions of all of them do not.
+    The mean square of errors N(0, S) is about chi-squared, with (tr S)^2 / tr S^2 degrees of freedom. Uncertain scales
+    add 4 s^2 to its relative variance: 2 / nu = 2 tr S^2 / (tr S)^2 + 4 s^2.
+
+    Args:
+        error: the expected one, m. covariance: S (R, R), m^2. scales_deviation: s, that of its logarithm.
     """
-    count = len(target)
-    whole = torch.block_diag(*bodies_of(placed.lever).averaging(target.target).expand(count, -1, -1))
-    if not placed.free:
-        return whole
-    points = target.at.task[0].points.view(count, -1, 3)
-    B = frame_slopes(points, points.mean((0, 1))).flatten(0, 1)
-    return whole - whole @ B @ torch.linalg.pinv(B)
+    if isinf(scales_deviation):
+        return inf
+    freedom = 1.0 / (float(covariance.square().sum() / covariance.trace() ** 2) + 2.0 * scales_deviation**2)
+    return error * (chi2_above(EXCEEDANCE_PROBABILITY, freedom) / freedom) ** 0.5

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.moved_devices import Cause
-from diffeo_calib.campaign.posterior import Seen, given
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.process.numbers import Numbers
 
 
 @dataclass(frozen=True)
@@ -133,6 +133,24 @@ class Verdict:
         return same | sizes | {"change": change, "text": str(self)}
 
 
+class Seen(NamedTuple):
+    """Rows as the accepted ones before them predict them.
+
+    Args:
+        numbers: R of them. error: (R,) measured minus predicted, m. covariance: (R, R) with noise, m^2.
+    """
+
+    numbers: Numbers
+    error: Tensor
+    covariance: Tensor
+
+    def given(self, wanted: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors, m, and covariance, m^2, of some numbers given others: masks (R,) of both."""
+        cross = self.covariance[wanted][:, known]
+        gain = torch.linalg.solve(self.covariance[known][:, known], cross.T).T
+        return self.error[wanted] - gain @ self.error[known], self.covariance[wanted][:, wanted] - gain @ cross.T
+
+
 class Measure(NamedTuple):
     """The distance of a row: d^2, its degrees of freedom, and the RMS of its error and of the expected one, m."""
 
@@ -153,9 +171,9 @@ def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | No
         seen: rows in order. row: its place. known: (N,) boolean: the rows that count as right. freedom: of the row.
         some: (R,) boolean: which of all numbers count; all of the row by default.
     """
-    owner = seen.rows.owner
+    owner = seen.numbers.owner
     wanted = (owner == row) if some is None else some & (owner == row)
-    error, covariance = given(seen.error, seen.covariance, wanted, known[owner] & (owner != row))
+    error, covariance = seen.given(wanted, known[owner] & (owner != row))
     square = float(error @ torch.linalg.solve(covariance, error))
     expected = float(covariance.diagonal().mean().clamp(min=0).sqrt())
     return Measure(square, freedom, float(error.square().mean().sqrt()), expected)
@@ -183,18 +201,18 @@ def find_change(
     """Change found among rows in order, the last one included; None if chance explains everything.
 
     Args:
-        seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, m, U) on them, m.
+        seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, R, U) on what they tell, m.
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
         single: the distance of the last row. typical: see :meth:`Measure.fits`.
     """
     if not causes:
         return None
     known, doubted = flags
-    owner, found, sizes = seen.rows.owner, [], [cause.effects.shape[2] for cause in causes]
-    effects = torch.cat([cause.effects for cause in causes], 2).flatten(0, 1)[seen.rows.visible.flatten()]
+    owner, found, sizes = seen.numbers.owner, [], [cause.effects.shape[2] for cause in causes]
+    effects = seen.numbers.of_table(torch.cat([cause.effects for cause in causes], 2))
     for first in range(len(numbers) - limits.fewest_rows + 1):
         after = (owner >= first) & doubted[owner]
-        error, covariance = given(seen.error, seen.covariance, after, (owner < first) & known[owner])
+        error, covariance = seen.given(after, (owner < first) & known[owner])
         low, whole = torch.linalg.cholesky(covariance), torch.cat([error[:, None], effects[after]], 1)
         error, *each = torch.linalg.solve_triangular(low, whole, upper=False).split([1, *sizes], 1)
         white = error[:, 0]
@@ -215,5 +233,6 @@ def find_change(
         return None
     others = {one[3].name for one in found if one[0] > score - limits.told_apart} - {cause.name}
     unit, size = cause.unit or ("mm", 1e-3)
-    change = float(u.abs().max()) if cause.unit else float((3 * moved.square().mean()).sqrt())
+    points = 3.0 if cause.basis is None else 3.0 * cause.basis.shape[2] / cause.basis.shape[1]  # numbers of a point
+    change = float(u.abs().max()) if cause.unit else float((points * moved.square().mean()).sqrt())
     return Change(numbers[first], cause.name, change / size, unit, tuple(sorted(others)), cause.fix)

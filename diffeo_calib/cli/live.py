@@ -9,10 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from diffeo_calib.campaign.campaign import Campaign
+from diffeo_calib.campaign.campaign import Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Sent, as_line, check_cells
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
-from diffeo_calib.campaign.planned import Next
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.live_options import LiveOptions

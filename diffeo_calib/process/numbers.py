@@ -88,6 +88,11 @@ class Numbers:
         later = [(*part[:6], part[6] + N * R) for part in other._given]
         return Numbers([*self._given, *later], (N + count, R))
 
+    def later(self, count: int) -> Numbers:
+        """These without the first ``count``."""
+        kept = [own for own, part in zip(self._given, self.parts, strict=True) if part.numbers.start >= count]
+        return Numbers(kept, self.shape)
+
     @property
     def none(self) -> Numbers:
         """No numbers, of rows like these."""

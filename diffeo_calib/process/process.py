@@ -83,13 +83,16 @@ class Expected:
     """Numbers as the rows so far predict them, without noise: mean (M,), covariance F + D D^T.
 
     Args:
-        mean: (M,). fields: F (M, M). features: D (M, K). white: (M', M) L^-1 F(rows so far, numbers).
+        numbers: of M. mean: (M,). fields: F (M, M). features: D (M, K). white: V (M', M) L^-1 F(rows so far, numbers).
+        unknowns: (M, K) S P^1/2 - V^T W.
     """
 
+    numbers: Numbers
     mean: Tensor
     fields: Tensor
     features: Tensor
     white: Tensor
+    unknowns: Tensor
 
     @property
     def covariance(self) -> Tensor:
@@ -135,21 +138,34 @@ class Process:
             L, info = torch.linalg.cholesky_ex(F)
         if int(info):
             raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
-        before = torch.cat([self.alpha[:, None], self.factor.W], 1)
-        right = torch.cat([new.target[:, None], new.S * self.variance.sqrt()], 1) - at.white.T @ before
-        both = torch.cat([before, torch.linalg.solve_triangular(L, right, upper=False)])
-        if len(self.alpha):
-            top = torch.cat([self.factor.L, torch.zeros_like(at.white)], 1)
-            L, new = torch.cat([top, torch.cat([at.white.T, L], 1)]), self.numbers.joined(new)
-        return replace(self, numbers=new, factor=Factor(L, both[:, 1:]), alpha=both[:, 0])
+        right = torch.cat([(new.target - at.white.T @ self.alpha)[:, None], at.unknowns], 1)
+        right, n = torch.linalg.solve_triangular(L, right, upper=False), len(self.alpha)
+        if n:
+            L, corner, new = L.new_zeros(n + len(L), n + len(L)), L, self.numbers.joined(new)
+            L[:n, :n], L[n:, :n], L[n:, n:] = self.factor.L, at.white.T, corner
+        factor = Factor(L, torch.cat([self.factor.W, right[:, 1:]]))
+        return replace(self, numbers=new, factor=factor, alpha=torch.cat([self.alpha, right[:, 0]]))
 
-    def expected(self, new: Numbers) -> Expected:
-        """Numbers as the rows so far predict them."""
-        V = torch.linalg.solve_triangular(self.factor.L, self._covariance(self.numbers, new), upper=False)
-        D = new.S * self.variance.sqrt() - V.T @ self.factor.W
-        mean = V.T @ self.alpha + D @ self._shift
-        features = torch.linalg.solve_triangular(self.factor.B, D.T, upper=False).T
-        return Expected(mean, self._covariance(new, new) - V.T @ V, features, V)
+    def expected(self, new: Numbers, before: Expected | None = None) -> Expected:
+        """Numbers as the rows so far predict them; ``before``: the same by the first of these rows alone."""
+        L, W = self.factor.L, self.factor.W
+        if before is None:
+            n, F, U = 0, self._covariance(new, new), new.S * self.variance.sqrt()
+            V = X = torch.linalg.solve_triangular(L, self._covariance(self.numbers, new), upper=False)
+        else:
+            n, F, U, V = len(before.white), before.fields, before.unknowns, before.white
+            if n == len(L):
+                return before
+            X = self._covariance(self.numbers.later(n), new) - L[n:, :n] @ V
+            X = torch.linalg.solve_triangular(L[n:, n:], X, upper=False)
+            V = torch.cat([V, X])
+        U = U - X.T @ W[n:]
+        features = torch.linalg.solve_triangular(self.factor.B, U.T, upper=False).T
+        return Expected(new, V.T @ self.alpha + U @ self._shift, F - X.T @ X, features, V, U)
+
+    def between(self, a: Expected, b: Expected) -> Tensor:
+        """Covariance (Ma, Mb) of numbers as the rows so far predict them."""
+        return self._covariance(a.numbers, b.numbers) - a.white.T @ b.white + a.features @ b.features.T
 
     def _covariance(self, a: Numbers, b: Numbers) -> Tensor:
         """Prior covariance by the fields (Ma, Mb)."""

@@ -22,9 +22,8 @@ from threading import Condition
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from diffeo_calib.campaign.campaign import Campaign
+from diffeo_calib.campaign.campaign import Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, LOCAL, Sent, Server, running
-from diffeo_calib.campaign.planned import Next
 
 PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500

@@ -14,9 +14,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.campaign.certainty import limit_of
-from diffeo_calib.campaign.model import with_joints
-from diffeo_calib.campaign.posterior import Posterior, Rows, Seen
+from diffeo_calib.campaign.model import limit_of, with_joints
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.observations import joined_tables
@@ -127,23 +125,6 @@ def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
         assert campaign.accepted == list(range(ROWS))
     assert 1 < change.size < 4
     assert change.unit == "mrad"
-
-
-def test_rows_taken_one_by_one_are_those_of_a_fresh_factor(running: dc.Campaign) -> None:
-    model: Any = copy.deepcopy(running)._model
-    rows = Rows.of(model.data, model.scales)
-    index = torch.arange(len(rows))
-    whole = Posterior(rows.rows(index[:9]), model.posterior.asked)
-    grown = Posterior(rows.rows(index[:3]), model.posterior.asked)
-    later = Seen.joined(*(grown.see(rows.rows(some)) for some in (index[3:5], index[5:])))
-    for row in range(3, 9):
-        later = grown.take(grown.see(rows.rows(index[row : row + 1])), later)
-    expected = whole.see(rows.rows(index[3:]))
-    for one in (later, grown.see(rows.rows(index[3:])), later.some(index[: len(later.rows)])):
-        assert_close(one.error, expected.error)
-        assert_close(one.covariance, expected.covariance)
-        assert_close(one.asked, expected.asked)
-    assert_close(grown.known, whole.known)
 
 
 def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:

@@ -121,6 +121,17 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
         assert_close(other @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
 
 
+def test_what_was_expected_before_goes_on_with_later_rows(case: Case) -> None:
+    first, second, new = cut(case)
+    known = first.data.process(case.scales)
+    whole = known.given(second.numbers, second.noise)
+    expected, found = noiseless(whole, new), whole.expected(new.numbers, noiseless(known, new))
+    close(found.mean, expected.mean, 1e-9)
+    close(found.covariance, expected.covariance, 1e-9)
+    close(whole.between(found, expected), expected.covariance, 1e-9)
+    assert whole.expected(new.numbers, expected) is expected
+
+
 def test_evidence_of_later_rows_is_a_difference(case: Case) -> None:
     first, second, _ = cut(case)
     before = first.data.process(case.scales)

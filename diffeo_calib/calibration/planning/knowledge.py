@@ -19,7 +19,7 @@ models", 1996; sequential A-optimal design for predictions). Taking one costs on
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -179,6 +179,47 @@ class Knowledge:
         self.blocks = self.blocks - each.mT @ each
         self._with_shifts = self._with_shifts - added.T @ added[:, self._shifts]
         return added
+
+
+class Chosen(NamedTuple):
+    """Options in the order in which they were taken, and by what (r, k) each lowers the covariance of k directions."""
+
+    order: list[int]
+    lowered: list[Tensor]
+
+
+def greedy(
+    C: Tensor, own: Tensor, between: Callable[[int], Tensor], *, place: Tensor, open_: Tensor, count: int
+) -> Chosen:
+    """Options that lower the variance in k directions most, one after the other, see the module.
+
+    Args:
+        C: (k, M r) covariance of the directions with the M options. own: (M, r, r) that of each, with noise.
+        between: covariance (r, M r) of an option with all, without noise.
+        place: (M,) where each is measured: at one place one is taken. open_: (M,) boolean: those that can be taken.
+
+    Raises:
+        NumericalError: the covariance of an option is not positive definite.
+    """
+    M, r, _ = own.shape
+    found, taken = Chosen([], []), C.new_zeros(0, M * r)
+    for _ in range(count):
+        each = C.T.reshape(M, r, -1)
+        gains = torch.linalg.solve(own, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
+        best = int(torch.where(open_, gains, -torch.inf).argmax())
+        mine = slice(best * r, best * r + r)
+        factor, info = torch.linalg.cholesky_ex(0.5 * (own[best] + own[best].T))
+        if int(info):
+            raise NumericalError.of("the covariance of the planned measurements is singular", fix=NOISE_ADVICE)
+        with large_work(taken.numel()):
+            both = torch.cat([between(best) - taken[:, mine].T @ taken, C[:, mine].T], 1)
+            both = torch.linalg.solve_triangular(factor, both, upper=False)
+            row, by = both[:, : M * r], both[:, M * r :]
+            C, taken, each = C - by.T @ row, torch.cat([taken, row]), row.T.reshape(M, r, r)
+        own, open_ = own - each @ each.mT, open_ & (place != place[best])
+        found.order.append(best)
+        found.lowered.append(by)
+    return found
 
 
 MAIN_DIRECTIONS = 150
