@@ -33,9 +33,10 @@ def in_other_unit(rows: Any, factor: float) -> Any:
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize(("factor", "unit"), [(math.pi / 180, "radians"), (180 / math.pi, "degrees")])
 @pytest.mark.parametrize("name", marked("ball in sockets", "positions", "heights", "several kinds"))
-def test_rows_in_another_unit_of_angles_are_refused(name: str, factor: float, unit: str, verb: str) -> None:
+def test_rows_in_another_unit_of_angles_are_named(name: str, factor: float, unit: str, verb: str) -> None:
+    """Refused; small values of some joints lie in the ranges of the fit, too, and are warned of."""
     kind = kind_named(name)
-    with pytest.raises(MeasurementError, match=f"the joint values seem to be {unit}.*check the angle unit"):
+    with pytest.raises((MeasurementError, dc.DiffeoCalibWarning), match=f"the joint values seem to be {unit}.*check the angle unit"):
         VERBS[verb](kind.model, in_other_unit(kind.new, factor))
 
 
