@@ -95,7 +95,6 @@ def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
     [
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*WIRE, "--socket", "a,b"], "column 'a': expected one column of this name"),
-        ([*WIRE, "--reading", "height=wire"], "no place of ball and devices explains the readings"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
         (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
         (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
@@ -120,6 +119,15 @@ def test_refused(
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())
     assert not Path("none.safetensors").exists()
+
+
+def test_readings_that_no_place_explains_are_warned_of(
+    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "--reading", "height=wire", "-o", "warned.safetensors")
+    assert done.code == 0
+    assert "no place of ball and devices explains the readings" in " ".join(done.err.split())
 
 
 def test_several_kinds_are_one_table(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The tangent model is Gaussian-process regression: likelihood, leave-one-out, first Gauss-Newton iterate."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from fit_bank import deformed, noise_blocks
@@ -67,22 +65,6 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
     torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
     mu = torch.linalg.solve(expected, (problem.y - k0).flatten()).reshape(problem.y.shape)
     torch.testing.assert_close(dense(regression).mu(regression.target), mu, rtol=1e-8, atol=1e-8)
-
-
-@every_problem
-@pytest.mark.parametrize("build", [tangent, around])
-def test_log_marginal_likelihood(problem: Problem, build: Callable[[Problem], Regression]) -> None:
-    regression = build(problem)
-    covariance = factor(regression) @ factor(regression).T
-    gaussian = torch.distributions.MultivariateNormal(
-        torch.zeros(len(covariance), dtype=torch.float64), covariance_matrix=covariance
-    )
-    actual, expected = (
-        dense(regression).log_marginal_likelihood(regression.target),
-        gaussian.log_prob(regression.target.flatten()),
-    )
-    assert actual.dtype == torch.float64
-    torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
 
 
 @every_problem

@@ -83,19 +83,6 @@ def test_shares_of_processes_add_up() -> None:
         torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)
 
 
-@every_formula
-def test_single_points_have_double_totals(formula: Formula) -> None:
-    """The error of a sum does not grow with the number of points."""
-    single = mapped(points(5000, 3), Tensor.float)
-    few = mapped(single, lambda t: t[:40])
-    found = Fused().reduce(formula, GaussianProfile(), few, single, torch.float64)
-    expected = fused(formula, GaussianProfile(), mapped(few, Tensor.double), mapped(single, Tensor.double))
-    assert found is not None
-    for one, other in zip(found, expected, strict=True):
-        assert one.dtype is torch.float64
-        torch.testing.assert_close(one, other, rtol=0, atol=3e-6 * float(other.abs().max()) * 5)
-
-
 def test_points_of_two_types_are_not_mixed() -> None:
     j = points(40, 2)
     mixed = j._replace(momenta=j.momenta.float())
