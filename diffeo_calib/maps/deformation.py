@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import LARGEST
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.base import Kernel
@@ -160,13 +161,11 @@ def finite(points: Tensor, what: str) -> Tensor:
     """Return ``points``, the end of a flow.
 
     Raises:
-        NumericalError: some are not finite; ``what`` names the flow.
+        NumericalError: some are not finite, or too large to compute with; ``what`` names the flow.
     """
-    if not bool(torch.isfinite(points.detach()).all()):
-        raise NumericalError.of(
-            f"{what}: the momenta are too large for its time steps",
-            fix="start nearer (from zero or Gauss-Newton), or use more time steps",
-        )
+    if not bool((points.detach().abs() <= LARGEST).all()):
+        what = f"{what}: the momenta are too large for its time steps"
+        raise NumericalError.of(what, fix="start nearer (from zero or Gauss-Newton), or use more time steps")
     return points
 
 

@@ -28,7 +28,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.deformation import ModelSpec, Momenta, finite
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots import elastic_rr
@@ -337,3 +337,10 @@ def test_gradient_of_the_end_in_all_momenta(arm: Arm) -> None:
     live = vector.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(live), live)
     torch.testing.assert_close(gradient @ direction, central_difference(loss, vector, direction), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("value", [1e200, -1e80, float("inf"), float("nan")])
+def test_ends_too_large_to_compute_with_are_overflows(value: float) -> None:
+    """Kinematics refuse them as bad input: a trial step of a fit must end as one that is too long."""
+    with pytest.raises(NumericalError, match="the flow overflows: the momenta are too large"):
+        finite(tensor([[0.0, value]]), "the flow overflows")
