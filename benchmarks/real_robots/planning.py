@@ -44,8 +44,7 @@ from robot_data import data_folder, find, read
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.knowledge import Knowledge, of_model
-from diffeo_calib.calibration.planning.sensors import Positions
+from diffeo_calib.calibration.planning.knowledge import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -192,11 +191,12 @@ def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         placed = model.registered(new, free="base")
     start = of_model(placed, torch.cat([new.q, test.q]), "base")
-    knowledge = Knowledge(start.at, start.features, Positions().options(start.scene), start.shifts, room=0)
     rows, size = torch.arange(len(new)), new.points.numel()
-    cross = knowledge.between(rows)
-    inner = cross[:, :size] + torch.block_diag(*start.noise[rows])
-    known = cross[:, size:].T @ torch.linalg.solve(inner, (new.points - placed(new.q)).flatten())
+    cross = start.known.between(rows)
+    inner = cross[:, :size] + torch.block_diag(*start.scene.noise[rows])
+    known = cross[:, size : size + test.points.numel()].T @ torch.linalg.solve(
+        inner, (new.points - placed(new.q)).flatten()
+    )
     errors = (placed(test.q) + known.view_as(test.points) - test.points).norm(dim=-1).flatten()
     return {"rms_mm": 1e3 * float(errors.square().mean().sqrt()), "p95_mm": 1e3 * float(errors.quantile(0.95))}
 

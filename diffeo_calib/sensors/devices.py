@@ -129,18 +129,6 @@ class Devices(ABC):
             return points
         return of_frames(poses_of_triangles(points.unflatten(1, (-1, POINTS, 3))))
 
-    @classmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:
-        """Constants (c,) of a device by derivatives of its readings at points (N, 3), m.
-
-        Args:
-            slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
-
-        Returns:
-            None for a kind that does not say this: its devices are not planned for unless they are named.
-        """
-        return None
-
     def where(self, number: int) -> str:
         """Where a device is, in words."""
         return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
@@ -351,12 +339,6 @@ def median_weights(distances: Tensor, half: float) -> Tensor:
 def across(directions: Tensor) -> Tensor:
     """Two unit vectors at right angles to each direction and to each other: (..., 3) -> (..., 2, 3)."""
     return torch.linalg.svd(directions[..., None, :], full_matrices=True).Vh[..., 1:, :]
-
-
-def meeting_point(points: Tensor, directions: Tensor) -> Tensor:
-    """The point (3,) nearest to lines through points (N, 3), m, along unit vectors (N, 3)."""
-    off = torch.eye(3, dtype=points.dtype, device=points.device) - directions[:, :, None] * directions[:, None]
-    return torch.linalg.lstsq(off.sum(0), (off @ points[:, :, None]).sum(0)).solution[:, 0]
 
 
 def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:

@@ -66,11 +66,6 @@ class Planes(Devices):
         return torch.cat([normals, numbers[:, 3:]], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
-        """The normal; the distance changes no slope."""
-        return torch.cat([slopes[0, 0], slopes.new_zeros(1)])
-
-    @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
         """The unit normal n and the distance d of least squares of n.z - d - h."""
         values = values[:, 0]

@@ -16,7 +16,6 @@ from diffeo_calib.sensors.devices import (
     SMALLEST_M,
     Devices,
     Effect,
-    meeting_point,
     numbers_text,
 )
 
@@ -59,17 +58,6 @@ class Cameras(Devices):
         own = self.poses[device]
         seen = (own[:, :3, :3] @ points[:, :, None])[..., 0] + own[:, :3, 3]
         return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
-
-    @classmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
-        """Lines of sight, along which an image stays, meet in the camera; slopes are projections turned by it."""
-        along = torch.nn.functional.normalize(torch.linalg.cross(slopes[:, 0], slopes[:, 1]), dim=1)
-        projection = by_constants[..., :3]
-        R = nearest_rotations(torch.linalg.lstsq(projection.flatten(0, 1), slopes.flatten(0, 1)).solution)
-        seen = (points - meeting_point(points, along)) @ R.mT
-        depth = (projection[:, 0, 0] * seen[:, 2]).median()
-        t = -R @ meeting_point(points, along)
-        return torch.cat([transforms(R, t)[:3].flatten(), depth[None]])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

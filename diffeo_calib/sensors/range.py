@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_use
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import Devices, Effect, least_squares, meeting_point, numbers_text
+from diffeo_calib.sensors.devices import Devices, Effect, least_squares, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -53,11 +53,6 @@ class FixedPoints(Devices):
     def stated(cls, numbers: Tensor) -> Tensor:
         """The fixed points."""
         return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
-
-    @classmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
-        """Lines along which distances grow meet at the fixed point."""
-        return cls.stated(meeting_point(points, slopes[:, 0])[None])[0]
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

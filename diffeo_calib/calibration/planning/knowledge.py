@@ -19,8 +19,8 @@ models", 1996; sequential A-optimal design for predictions). Taking one costs on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -44,8 +44,7 @@ from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_memory
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, diagonal_blocks
+from diffeo_calib.regression.conditional import NOISE_ADVICE, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -55,220 +54,165 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import device_coordinates
 
 
-class Knowledge:
-    """Covariances of the markers at M configurations, and how measurements there change them.
+class Known(NamedTuple):
+    """Covariances F + V^T diag(signs) V of the markers at M configurations and of c shifts that measurements share.
 
     Args:
-        at: first-order response of the markers there; only its fields are used.
-        features: everything else, see the module, for one group of configurations after the other.
-        options: the measurements that can be made there.
-        shifts: (k, c0) the features of the first shifts; the other ones are new.
-        room: how many measurements will be made; memory is set aside for them.
-
-    Attributes:
-        blocks: (M, m, m) covariance of each configuration, m^2.
-
-    Raises:
-        InputError: the features need more memory than is free.
+        at: first-order response of the markers, M of m coordinates; of its fields is F.
+        values: V (k, M m + c). signs: (k,) 1 or -1.
     """
 
-    def __init__(
-        self, at: Linearisation, features: Iterable[Features], options: Options, shifts: Tensor, room: int
-    ) -> None:
-        self.options, self._fields, self._known = options, at.fields, 0
-        self._values = self._signs = options.slopes.new_empty(0)
-        M, self.m, _ = at.sensitivity.shape
-        self._shifts = slice(M * self.m, M * self.m + options.shared.shape[2])
-        eye = torch.eye(self.m, dtype=at.sensitivity.dtype, device=at.sensitivity.device).expand(M, self.m, self.m)
-        self.blocks = self._fields.projected(eye).own_blocks()
-        filled = 0
-        for values, signs in features:
-            if not filled:
-                self._make_room(signs, shifts, room)
-            count = values.shape[1] // self.m
-            self._values[: len(signs), filled * self.m : (filled + count) * self.m] = values
-            each = values.view(len(signs), count, self.m).movedim(0, 1)  # (count, k, m)
-            self.blocks[filled : filled + count] += (each.mT * signs) @ each
-            filled += count
-        values, signs = self._values[: self._known], self._signs[: self._known, None]
-        self._with_shifts = values.T @ (signs * values[:, self._shifts])  # (M m + c, c) covariance with the shifts
+    at: Linearisation
+    values: Tensor
+    signs: Tensor
 
-    def _make_room(self, signs: Tensor, known: Tensor, room: int) -> None:
-        """Memory for the features with these signs, those of the shifts, and those of ``room`` measurements."""
-        shifts = self._shifts.stop - self._shifts.start - known.shape[1]
-        self._known, numbers = len(signs) + shifts, self._shifts.stop
-        total = self._known + room * self.options.slopes.shape[1]
-        needed, free = BYTES_PER_FLOAT * total * numbers, free_memory()
-        if free is not None and needed > free:
-            what = f"{total} features of {len(self.blocks)} configurations need more memory than is free"
-            expected, got = (f"{count / BYTES_PER_GIB:.1f} GiB" for count in (needed, free))
-            raise InputError.of(what, expected=expected, got=got, fix="pass fewer candidates")
-        self._values = signs.new_empty(total, numbers)
-        self._values[: self._known, self._shifts] = 0.0
-        own, first = self._values[len(signs) : self._known], self._shifts.start + known.shape[1]
-        own.zero_()
-        own[:, first:] = torch.eye(shifts, dtype=own.dtype, device=own.device)
-        self._values[: len(known), self._shifts.start : first] = known
-        self._signs = signs.new_full((total,), -1.0)
-        self._signs[: len(signs)], self._signs[len(signs) : self._known] = signs, 1.0
+    @property
+    def m(self) -> int:
+        """Coordinates of a configuration."""
+        return self.at.sensitivity.shape[1]
+
+    @property
+    def shifts(self) -> int:
+        """Number c of the shifts."""
+        return self.values.shape[1] - self.at.sensitivity.shape[:2].numel()
+
+    def with_shifts(self, count: int) -> Known:
+        """The same with new shifts, ``count`` in all."""
+        values, new = torch.nn.functional.pad(self.values, (0, count - self.shifts)), count - self.shifts
+        own = values.new_zeros(new, values.shape[1])
+        own[:, values.shape[1] - new :] = torch.eye(new, dtype=own.dtype, device=own.device)
+        return self._replace(values=torch.cat([values, own]), signs=torch.cat([self.signs, self.signs.new_ones(new)]))
 
     def coordinates(self, rows: Tensor) -> Tensor:
         """Numbers of the coordinates of some configurations: (B,) -> (B m,)."""
         return (rows[:, None] * self.m + torch.arange(self.m, device=rows.device)).flatten()
 
-    def between(self, rows: Tensor, directions: Tensor | None = None) -> Tensor:
-        """K between some configurations and everything, or between linear functions of these and everything.
-
-        Args:
-            rows: (B,) row numbers. directions: (k, B m) linear functions.
-
-        Returns:
-            (B m, M m + c), or (k, M m + c), in m^2 and m.
-        """
-        values, signs = self._values[: self._known], self._signs[: self._known]
-        own = values[:, self.coordinates(rows)].T * signs  # (B m, features)
-        fields = self._fields.rows(rows).gram(self._fields)
+    def between(self, rows: Tensor) -> Tensor:
+        """Covariance (B m, M m + c) of some configurations (B,) with everything, m^2 and m."""
+        fields = self.fields(rows)
         with large_work(fields.numel()):
-            if directions is not None:
-                own, fields = directions @ own, directions @ fields
-            found = own @ values
-            found[:, : fields.shape[1]] += fields
-            return found
+            return fields.addmm_(self.values[:, self.coordinates(rows)].T * self.signs, self.values)
 
-    def covariances(self) -> Tensor:
-        """Covariance of every measurement that can be made, its noise included: (O, r, r), m^2."""
-        rows, A, D, R = self.options[:4]
-        with_shifts = self._with_shifts[: self._shifts.start].view(len(self.blocks), self.m, -1)  # (M, m, c)
-        cross = A @ with_shifts[rows] @ D.mT
-        return A @ self.blocks[rows] @ A.mT + cross + cross.mT + D @ self._with_shifts[self._shifts] @ D.mT + R
+    def fields(self, rows: Tensor) -> Tensor:
+        """The same of the fields alone."""
+        fields = self.at.fields
+        return torch.nn.functional.pad(fields.rows(rows).gram(fields), (0, self.shifts))
 
-    def without_motions(self, rows: Tensor, reference: Tensor, slopes: Tensor) -> Tensor:
-        """Covariances (B, m, m) of some configurations without the rigid motion that fits the errors at others best.
+    def blocks(self, rows: Tensor) -> Tensor:
+        """(B, m, m) that of some configurations, m^2."""
+        each = self.values[:, self.coordinates(rows)].view(len(self.signs), len(rows), self.m).movedim(0, 1)
+        return self.field_blocks(rows) + (each.mT * self.signs) @ each
 
-        Args:
-            rows: (B,) row numbers. reference: (T,) those of the others. slopes: (M, m, 6) by the rigid motion.
-        """
-        fit = torch.linalg.pinv(slopes[reference].flatten(0, 1))  # (6, T m)
-        between = self.between(reference, fit)
-        own = between[:, self.coordinates(reference)] @ fit.mT
-        cross = between[:, self.coordinates(rows)].T.reshape(len(rows), self.m, 6) @ slopes[rows].mT
-        return self.blocks[rows] - cross - cross.mT + slopes[rows] @ own @ slopes[rows].mT
+    def field_blocks(self, rows: Tensor) -> Tensor:
+        """The same of the fields alone."""
+        eye = torch.eye(self.m, dtype=self.values.dtype, device=rows.device).expand(len(rows), self.m, self.m)
+        return self.at.fields.rows(rows).projected(eye).own_blocks()
 
-    def with_options(self, values: Tensor) -> Tensor:
-        """Covariances (k, M m + c) with everything as those with all measurements: (O, r, k)."""
-        at, shifts = values[:, : self._shifts.start].T.reshape(len(self.blocks), self.m, -1), values[:, self._shifts].T
-        return self.options.slopes @ at[self.options.rows] + self.options.shared @ shifts
-
-    def measure(self, number: int) -> Tensor:
-        """Make one of the measurements: the features (r, M m + c) that it adds.
+    def given(self, options: Options) -> Known:
+        """After some measurements.
 
         Raises:
-            NumericalError: K + R is not positive definite.
+            NumericalError: their covariance is not positive definite.
         """
-        rows, A, D, R = (part[number : number + 1] for part in self.options[:4])
-        cross = A[0] @ self.between(rows) + D[0] @ self._with_shifts.T
-        inner = cross[:, self.coordinates(rows)] @ A[0].T + cross[:, self._shifts] @ D[0].T + R[0]
-        factor, info = torch.linalg.cholesky_ex(0.5 * (inner + inner.T))
-        if int(info):
-            raise NumericalError.of("the covariance of the planned measurements is singular", fix=NOISE_ADVICE)
-        with large_work(cross.numel()):
-            added = torch.linalg.solve_triangular(factor, cross, upper=False)
-        self._values[self._known : self._known + len(added)] = added
-        self._known += len(added)
-        each = added[:, : self._shifts.start].view(len(added), -1, self.m).movedim(0, 1)  # (M, r, m)
-        self.blocks = self.blocks - each.mT @ each
-        self._with_shifts = self._with_shifts - added.T @ added[:, self._shifts]
-        return added
+        fields = self.fields(options.rows).unflatten(0, (-1, self.m))  # (O, m, M m + c)
+        cross = (options.slopes @ fields).flatten(0, 1) + (options.of(self.values).T * self.signs) @ self.values
+        low = factor(options.of(cross) + torch.block_diag(*options.noise))
+        added = torch.linalg.solve_triangular(low, cross, upper=False)
+        values, signs = torch.cat([self.values, added]), torch.cat([self.signs, added.new_full((len(added),), -1.0)])
+        return self._replace(values=values, signs=signs)
 
 
-class Chosen(NamedTuple):
-    """Options in the order in which they were taken, and by what (r, k) each lowers the covariance of k directions."""
-
-    order: list[int]
-    lowered: list[Tensor]
+def factor(matrix: Tensor) -> Tensor:
+    """The lower Cholesky factor of the covariance of measurements; NumericalError unless it is positive definite."""
+    low, info = torch.linalg.cholesky_ex(0.5 * (matrix + matrix.mT))
+    if int(info):
+        raise NumericalError.of("the covariance of the planned measurements is singular", fix=NOISE_ADVICE)
+    return low
 
 
 def greedy(
     C: Tensor, own: Tensor, between: Callable[[int], Tensor], *, place: Tensor, open_: Tensor, count: int
-) -> Chosen:
+) -> list[int]:
     """Options that lower the variance in k directions most, one after the other, see the module.
 
     Args:
         C: (k, M r) covariance of the directions with the M options. own: (M, r, r) that of each, with noise.
         between: covariance (r, M r) of an option with all, without noise.
         place: (M,) where each is measured: at one place one is taken. open_: (M,) boolean: those that can be taken.
-
-    Raises:
-        NumericalError: the covariance of an option is not positive definite.
     """
     M, r, _ = own.shape
-    found, taken = Chosen([], []), C.new_zeros(0, M * r)
+    order, taken = list[int](), C.new_zeros(0, M * r)
     for _ in range(count):
         each = C.T.reshape(M, r, -1)
         gains = torch.linalg.solve(own, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
         best = int(torch.where(open_, gains, -torch.inf).argmax())
         mine = slice(best * r, best * r + r)
-        factor, info = torch.linalg.cholesky_ex(0.5 * (own[best] + own[best].T))
-        if int(info):
-            raise NumericalError.of("the covariance of the planned measurements is singular", fix=NOISE_ADVICE)
         with large_work(taken.numel()):
             both = torch.cat([between(best) - taken[:, mine].T @ taken, C[:, mine].T], 1)
-            both = torch.linalg.solve_triangular(factor, both, upper=False)
+            both = torch.linalg.solve_triangular(factor(own[best]), both, upper=False)
             row, by = both[:, : M * r], both[:, M * r :]
             C, taken, each = C - by.T @ row, torch.cat([taken, row]), row.T.reshape(M, r, r)
         own, open_ = own - each @ each.mT, open_ & (place != place[best])
-        found.order.append(best)
-        found.lowered.append(by)
-    return found
+        order.append(best)
+    return order
 
 
 MAIN_DIRECTIONS = 150
 """Directions of the targets whose variance is followed; the rest of it is far below the noise."""
 
 
-class Choice(NamedTuple):
-    """Chosen measurements in the order in which they were taken, and what they leave unknown.
-
-    Args:
-        order: (count,) numbers of the options. variance: (count + 1,) mean variance of the targets' coordinates after
-            0, 1, ... of them, m^2.
-    """
-
-    order: Tensor
-    variance: Tensor
-
-
-def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, scene: Scene) -> Choice:
+def choose(known: Known, options: Options, targets: Tensor, scene: Scene, count: int) -> tuple[list[int], Tensor]:
     """Choose ``count`` of the options, at most one at every configuration.
 
     Args:
-        knowledge: before the first measurement; it takes those that are chosen.
-        targets: (T,) row numbers of the configurations where the robot shall be known.
-        open_: (O,) boolean: the options that can be chosen, at ``count`` configurations or more.
+        known: before the first. targets: (T,) numbers of the configurations where the robot shall be known.
         scene: the configurations; it says of which errors the variance is reported.
+
+    Returns:
+        numbers of the options in the order in which they were taken, and the mean variance (count + 1,) of the targets'
+        coordinates after 0, 1, ... of them, m^2.
     """
-    m, rows, of_option = knowledge.m, knowledge.coordinates(targets), knowledge.options.rows
-    motions = scene.motions(targets)
-    P = torch.eye(len(rows), dtype=knowledge.blocks.dtype, device=rows.device)
+    rows = known.coordinates(targets)
+    P, motions = torch.eye(len(rows), dtype=known.values.dtype, device=rows.device), scene.motions(targets)
     if motions is not None:
         B = motions[targets].flatten(0, 1)
         P = P - B @ torch.linalg.pinv(B)
-    own = P @ knowledge.between(targets)[:, rows] @ P
-    _, V = torch.linalg.eigh(0.5 * (own + own.T))
-    main = V[:, -MAIN_DIRECTIONS:].T  # (k, T m)
-    C = knowledge.with_options(knowledge.between(targets, main))  # (O, r, k)
-    variance = [scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()]
-    open_, order = open_.clone(), []
-    for _ in range(count):
-        gains = torch.linalg.solve(knowledge.covariances(), C @ C.mT).diagonal(dim1=1, dim2=2).sum(1)
-        best = int(torch.where(open_, gains, -torch.inf).argmax())
-        order.append(best)
-        open_ &= of_option != of_option[best]
-        added = knowledge.measure(best)  # (r, M m + c)
-        C -= knowledge.with_options(added) @ (added[:, rows] @ main.T)
-        seen = scene.averaged @ (added[:, rows] @ P).view(len(added), len(targets), m, 1)  # (r, T, ., 1)
-        variance.append(variance[-1] - seen.square().sum(0).mean())
-    return Choice(torch.tensor(order, dtype=torch.int64, device=C.device), torch.stack(variance).clamp(min=0))
+    whole = P @ known.between(targets)  # (T m, M m + c)
+    own = whole[:, rows] @ P
+    V = torch.linalg.eigh(0.5 * (own + own.T)).eigenvectors[:, -MAIN_DIRECTIONS:]  # (T m, k)
+    features, A, place = options.of(known.values), options.slopes, options.rows
+    each = features.T.reshape(*A.shape[:2], -1)  # (O, r, f)
+    blocks = A @ known.field_blocks(place) @ A.mT + (each * known.signs) @ each.mT + options.noise
+
+    def between(number: int) -> Tensor:
+        fields = options.of(A[number] @ known.fields(place[number : number + 1]))
+        return fields.addmm_(each[number] * known.signs, features)
+
+    open_ = torch.ones_like(place, dtype=torch.bool)
+    order = greedy(options.of(V.T @ whole), blocks, between, place=place, open_=open_, count=count)
+    start = scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()
+    added = (
+        known.given(options.some(torch.tensor(order, dtype=torch.int64, device=rows.device))).values[
+            len(known.values) :, rows
+        ]
+        @ P
+    )
+    seen = (added.view(-1, len(targets), known.m) @ scene.averaged.mT).view(count, A.shape[1], -1)
+    lowered = seen.square().sum(1).mean(1)
+    return order, (start - torch.cat([lowered.new_zeros(1), lowered.cumsum(0)])).clamp(min=0)
+
+
+def without_motions(known: Known, rows: Tensor, reference: Tensor, slopes: Tensor) -> Tensor:
+    """Covariances (B, m, m) of some configurations without the rigid motion that fits the errors at others best.
+
+    Args:
+        rows: (B,) row numbers. reference: (T,) those of the others. slopes: (M, m, 6) by the rigid motion.
+    """
+    fit = torch.linalg.pinv(slopes[reference].flatten(0, 1))  # (6, T m)
+    between = fit @ known.between(reference)
+    own = between[:, known.coordinates(reference)] @ fit.mT
+    cross = between[:, known.coordinates(rows)].T.reshape(len(rows), known.m, 6) @ slopes[rows].mT
+    return known.blocks(rows) - cross - cross.mT + slopes[rows] @ own @ slopes[rows].mT
 
 
 USUAL_RESIDUAL = 3e-4
@@ -278,21 +222,11 @@ MARKER = (0.1, 0.0, 0.1)
 FREE = ("base", "marker", "both")
 
 
-@dataclass(frozen=True)
-class Start:
-    """What is known at some configurations.
+class Start(NamedTuple):
+    """What is known at some configurations, shifts of the rows of a fit among it, and the markers there."""
 
-    Args:
-        at: first-order response of the markers, whose fields are unknown.
-        features: parameters, earlier data, and what may have moved, for one group of configurations after the other.
-        scene: the markers there.
-        shifts: (k, c0) features of the shifts that rows of the fit shared.
-    """
-
-    at: Linearisation
-    features: Iterable[Features]
+    known: Known
     scene: Scene
-    shifts: Tensor
 
 
 def of_robot(
@@ -318,12 +252,12 @@ def of_robot(
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
     data = replace(data, held=held_parameters(geometry) if adrift else ())
-    features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
-    noise = data.noise(scales)
+    values = (data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T
+    known, noise = Known(data.linearisation(scales), values, torch.ones_like(values[:, 0])), data.noise(scales)
     scene = Scene(
         data.points, noise, geometry.base, bodies_of(lever).averaging(noise), 3 * len(tool.points), free=adrift
     )
-    return Start(data.linearisation(scales), [features], scene, noise.new_zeros(len(features.signs), 0))
+    return Start(known, scene)
 
 
 class Tool(NamedTuple):
@@ -371,64 +305,46 @@ def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: 
 def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     """The posterior of a fitted model.
 
+    A ball beside markers stays on its tool: no row of the device would say where it is now.
+
     Args:
-        model: fitted, or registered anew.
-        q: (M, n) configurations.
+        model: fitted, or registered anew. q: (M, n) configurations.
         free: what may have moved since the fit, besides what a registration has left free.
     """
-    fitted = model.map
-    groups = q.split(PREDICT_ROWS)
-    points, parts = zip(*(fitted.geodesic.linearised_value(rows) for rows in groups), strict=True)
-    noise, adrift = fitted.new_noise, fitted.workspace is not None
+    fitted, registration, conditional = model.map, model.map.registration, model.map.conditional
+    if isinstance(conditional, WithoutRigidMotions):  # devices and robot have them in common
+        conditional = conditional.conditional
+    if registration is not None and free != registration.free:
+        free = registration.free if free is None else "both"
+    noise, nominal, adrift = fitted.new_noise, fitted.geodesic.spec.nominal, fitted.workspace is not None
     seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
-    features = (_features(fitted, at, rows, free, seen) for at, rows in zip(parts, groups, strict=True))
-    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
-    shifts = noise.new_zeros(0, 0)
-    if fitted.noise.shared.shape[2] and fitted.registration is None:
-        shifts = _conditional(fitted).shift_features()
-    scene = Scene(torch.cat(points), *known, seen, adrift, shifts.shape[1])
-    return Start(Linearisation.joined(parts), features, scene, shifts)
 
+    def moved(at: Linearisation, rows: Tensor) -> Iterator[Tensor]:
+        """(M, m, k) what is open of the markers, or may have moved them."""
+        open_ = fitted.open_sensitivity(nominal, rows) if registration is None else None
+        if open_ is not None:
+            yield open_ @ fitted.open_directions
+        if free in ("base", "both"):
+            points = at.task[-1].points.view(len(rows), -1, 3)
+            yield PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0))
+        if free in ("marker", "both"):
+            yield PLACES.found_m_rad * _by_marker(fitted, at)[..., :seen]
 
-def _conditional(fitted: FittedMap) -> Conditional:
-    """That of the fit, with the rigid motions that no device shows: devices and robot have them in common."""
-    found = fitted.conditional
-    return found.conditional if isinstance(found, WithoutRigidMotions) else found
-
-
-def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
-    """Rows (M, n) of a registration, which tell where the device stands; none if it has moved again."""
-    fitted = model.map
-    if fitted.registration is not None and free is None:
-        return fitted.registration.q
-    return fitted.x[:0]
-
-
-def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None, seen: int) -> Features:
-    """Features of a linearisation at q, and of what may have moved: of the markers the first ``seen`` coordinates.
-
-    A ball beside them stays on its tool: no row of the device would say where it is now.
-    """
-    known = _conditional(fitted).features(at)
-    added = []
-    if fitted.registration is not None:
-        free = _either(free, fitted.registration.free)
-    else:
-        sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, q)
-        if sensitivity is not None:
-            added.append(sensitivity @ fitted.open_directions)
-    if free in ("base", "both"):
-        points = at.task[-1].points.view(len(q), -1, 3)
-        added.append(PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
-    if free in ("marker", "both"):
-        added.append(PLACES.found_m_rad * _by_marker(fitted, at)[..., :seen])
-    more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
-    return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
-
-
-def _either(first: str | None, second: str) -> str:
-    """What is free if either leaves it free."""
-    return second if first is None or first == second else "both"
+    points, parts, values = [], [], []
+    for rows in q.split(PREDICT_ROWS):
+        z, at = fitted.geodesic.linearised_value(rows)
+        known, signs = conditional.features(at)
+        added = [each.flatten(0, 1).T for each in moved(at, rows)]
+        points.append(z)
+        parts.append(at)
+        values.append(torch.cat([known, *added]))
+    whole = torch.cat(values, 1)
+    new = len(whole) - len(signs)
+    if fitted.noise.shared.shape[2] and registration is None:
+        whole = torch.cat([whole, torch.nn.functional.pad(conditional.shift_features(), (0, 0, 0, new))], 1)
+    own = Known(Linearisation.joined(parts), whole, torch.cat([signs, signs.new_ones(new)]))
+    along = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
+    return Start(own, Scene(torch.cat(points), *along, seen, adrift, own.shifts))
 
 
 def _by_marker(fitted: FittedMap, at: Linearisation) -> Tensor:

@@ -15,13 +15,13 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.candidates import check_limits
 from diffeo_calib.calibration.planning.knowledge import (
     FREE,
-    Knowledge,
+    Known,
     Start,
     choose,
     of_model,
     of_robot,
-    registered_rows,
     tool_of,
+    without_motions,
 )
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
@@ -246,7 +246,10 @@ def plan(
             limits, a marker beyond its reach, fewer candidates than poses that a device can measure, or an argument
             that belongs to a robot with a model, and vice versa.
     """
-    robot = _robot(robot_or_model)
+    if not isinstance(robot_or_model, Tree | CalibratedKinematics):
+        expected = "a robot (dc.Tree) or its model (dc.CalibratedKinematics)"
+        raise InputError.of("`robot_or_model`", expected=expected, got=type(robot_or_model).__name__)
+    robot = robot_or_model if isinstance(robot_or_model, Tree) else robot_or_model.robot
     q = _configurations(robot, candidates, "candidates")
     check_limits(robot, q, "candidates")
     check_count(count, "`count`, at most the number of candidates", most=len(q))
@@ -256,17 +259,15 @@ def plan(
     sensors = sensors_for(robot_or_model, sensor)
     own = marker, hyperparameters, sensors
     start, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
-    options, open_, before = _options(start, sensors, (at_known, at_candidates[0], len(known)), count)
-    knowledge = Knowledge(start.at, start.features, options, start.shifts, room=len(before) + count)
-    for number in before:
-        knowledge.measure(number)
-    known_rms = _known_rms(robot_or_model, start.scene, knowledge, (at_candidates, at_targets))
-    found = choose(knowledge, at_targets, open_, count, start.scene)
+    before, options = _options(start.scene, sensors, (at_known, at_candidates[0], len(known)), count)
+    knowledge = start.known.with_shifts(options.shared.shape[2])
+    knowledge = knowledge.given(before) if len(before.rows) else knowledge
+    order, variance = choose(knowledge, options, at_targets, start.scene, count)
     LOG.info("%d poses chosen of %d", count, len(q))
     return Plan(
-        **_in_order(robot, q, options.some(found.order), int(at_candidates[0])),
-        expected_rms=(3 * found.variance).sqrt(),
-        known_rms=known_rms,
+        **_in_order(robot, q, options.some(order), int(at_candidates[0])),
+        expected_rms=(3 * variance).sqrt(),
+        known_rms=_known_rms(robot_or_model, start.scene, knowledge, (at_candidates, at_targets)),
         noise_rms=_noise_rms(start.scene, sensors, at_targets),
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
@@ -298,66 +299,53 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
 
 
 def _options(
-    start: Start, sensors: tuple[Sensor, ...], groups: tuple[Tensor, Tensor, int], count: int
-) -> tuple[Options, Tensor, list[int]]:
-    """What can be measured, (O,) which of it at candidates, and numbers of what was measured already.
+    scene: Scene, sensors: tuple[Sensor, ...], groups: tuple[Tensor, Tensor, int], count: int
+) -> tuple[Options, Options]:
+    """What was measured already, and what can be measured at candidates.
 
     Args:
-        start: the configurations. sensors: what will measure.
+        scene: the configurations. sensors: what will measure.
         groups: row numbers of known configurations, of the first candidate, and how many known ones the user gave: the
             other ones belong to a registration, whose device measured positions or poses.
         count: poses to choose.
     """
     known, first, given = groups
-    shifts = start.scene.shifts
-    every = Options.joined([one.options(start.scene) for one in sensors], shifts)
-    mine = (every.rows >= known[0] if len(known) else every.rows >= first) & (every.rows < first)
-    by_user = mine & (every.rows < first - (len(known) - given))
+    every = Options.joined([one.options(scene) for one in sensors], scene.shifts)
+    registration = int(first) - len(known) + given  # its first row
+    by_user = (every.rows >= registration - given) & (every.rows < registration)
     if given and (len(every.names) > 1 or int(by_user.sum()) < given):
         fix = "leave `measured` out, and fit the model again with these rows"
         raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
-    kept = by_user | (every.rows >= first)
-    every = every.some(kept)
-    options = [every]
-    if len(known) > given:
-        registered = Positions(whole=start.scene.framed).options(start.scene)
-        options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
-    whole = Options.joined(options, shifts) if len(options) > 1 else every
-    whole = whole._replace(names=every.names)
-    open_ = whole.rows >= first
-    reachable = len(whole.rows[open_].unique())
+    reachable = len(every.rows[every.rows >= first].unique())
     if reachable < count:
         fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
         fix += "its sockets"
         what = "candidates that can be measured"
         raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
-    return whole, open_, (whole.rows < first).nonzero()[:, 0].tolist()
+    whole = every.some(by_user | (every.rows >= first))
+    if len(known) > given:
+        registered = Positions(whole=scene.framed).options(scene)
+        registered = registered.some((registered.rows >= registration) & (registered.rows < first))
+        whole = Options.joined([whole, registered], scene.shifts)._replace(names=every.names)
+    return whole.some(whole.rows < first), whole.some(whole.rows >= first)
 
 
-def _known_rms(
-    given: Tree | CalibratedKinematics, scene: Scene, knowledge: Knowledge, rows: tuple[Tensor, Tensor]
-) -> Tensor:
+def _known_rms(given: Tree | CalibratedKinematics, scene: Scene, known: Known, rows: tuple[Tensor, Tensor]) -> Tensor:
     """RMS error of the markers, or origins, at candidates: (M,) m; ``rows``: numbers of these and of the targets."""
     candidates, targets = rows
     motions = scene.motions(targets)
-    blocks = knowledge.blocks[candidates]
-    if motions is not None:
-        blocks = knowledge.without_motions(candidates, targets, motions)
+    blocks = known.blocks(candidates) if motions is None else without_motions(known, candidates, targets, motions)
     blocks = scene.along(blocks)
     if isinstance(given, CalibratedKinematics):
         blocks = given.map.with_second_order(blocks)
     return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()
 
 
-def _rms(blocks: Tensor) -> float:
-    """RMS distance of covariances (M, r, r), m^2."""
-    return float(3 * blocks.diagonal(dim1=1, dim2=2).mean()) ** 0.5
-
-
 def _noise_rms(scene: Scene, sensors: Sequence[Sensor], targets: Tensor) -> float:
     """RMS noise of a measured position, m: of the first sensor with positions of a stated deviation, or of the rows."""
-    stated = next((one.std for one in sensors if one.of_positions and one.std is not None), None)
-    return _rms(scene.along(scene.noise[targets])) if stated is None else 3**0.5 * stated
+    stated = next((one.std for one in sensors if isinstance(one, Positions) and one.std is not None), None)
+    noise = scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
+    return float(3 * noise) ** 0.5 if stated is None else 3**0.5 * stated
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
@@ -388,17 +376,9 @@ def _configurations(robot: Tree, values: object, name: str) -> Tensor:
     return q.detach()
 
 
-def _thinned(q: Tensor, coordinates: int) -> Tensor:
-    """Evenly spaced rows of configurations with this many coordinates each."""
-    most = max(2, TARGET_COORDINATES // coordinates)
-    if len(q) <= most:
-        return q
-    return q[torch.linspace(0, len(q) - 1, most, dtype=torch.float64, device=q.device).round().long()]
-
-
 def _start(
     given: tuple[Tree | CalibratedKinematics, str | None],
-    groups: tuple[Tensor, ...],
+    groups: tuple[Tensor, Tensor, Tensor],
     own: tuple[Any, Any, tuple[Sensor, ...]],
 ) -> tuple[Start, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
@@ -409,27 +389,19 @@ def _start(
         own: marker and scales of a robot, and what will measure.
     """
     robot, free = given
-    wanted, known, q = groups
+    near, known, q = groups
+    positions = [sensor for sensor in own[2] if isinstance(sensor, Positions)]
     if isinstance(robot, Tree):
-        frames = any(sensor.of_frames for sensor in own[2])
+        frames = any(sensor.whole for sensor in positions)
         tool = tool_of(robot, torch.eye(4, dtype=q.dtype, device=q.device) if own[0] is None and frames else own[0])
-        near = _thinned(wanted, 3 * len(tool.points))
-        every = torch.cat([near, known, q])
-        adrift = not any(sensor.of_positions for sensor in own[2])
-        start = of_robot(robot, tool, every, near, own[1], adrift=adrift)
+    elif robot.map.registration is not None and free is None:  # its rows tell where the device stands
+        known = torch.cat([known, robot.map.registration.q.to(q.device)])
+    most = max(2, TARGET_COORDINATES // (3 * len(tool.points) if isinstance(robot, Tree) else robot.map.m))
+    if len(near) > most:
+        near = near[torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=q.device).round().long()]
+    every = torch.cat([near, known, q])
+    if isinstance(robot, Tree):
+        start = of_robot(robot, tool, every, near, own[1], adrift=not positions)
     else:
-        near = _thinned(wanted, robot.map.m)
-        known = torch.cat([known, registered_rows(robot, free).to(q.device)])
-        every = torch.cat([near, known, q])
         start = of_model(robot, every, free)
     return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])
-
-
-def _robot(given: object) -> Tree:
-    """The chain of a robot or of a model."""
-    if isinstance(given, Tree):
-        return given
-    if isinstance(given, CalibratedKinematics):
-        return given.robot
-    expected = "a robot (dc.Tree) or its model (dc.CalibratedKinematics)"
-    raise InputError.of("`robot_or_model`", expected=expected, got=type(given).__name__)

@@ -113,6 +113,12 @@ class Options(NamedTuple):
             before, devices, names = before + own, devices + len(part.names), names + part.names
         return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
+    def of(self, values: Tensor) -> Tensor:
+        """Numbers (k, M m + c) of the coordinates and shifts as those of all measurements: (k, O r)."""
+        c, m = self.shared.shape[2], self.slopes.shape[2]
+        at, shifts = values[:, : values.shape[1] - c].T.reshape(-1, m, len(values)), values[:, values.shape[1] - c :].T
+        return (self.slopes @ at[self.rows] + self.shared @ shifts).flatten(0, 1).T
+
     def some(self, index: Tensor) -> Options:
         """Some of them."""
         return Options._make([*(part[index] for part in self[:5]), self.names])
@@ -189,16 +195,6 @@ class Sensor(ABC):
         """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
         return []
 
-    @property
-    def of_positions(self) -> bool:
-        """Whether errors of held-out rows are errors of positions."""
-        return False
-
-    @property
-    def of_frames(self) -> bool:
-        """Whether it measures frames, not markers."""
-        return False
-
     @staticmethod
     def _new(scene: Scene, shared: Tensor) -> Tensor:
         """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
@@ -247,16 +243,6 @@ class Positions(Sensor):
         noise = self._noise(scene, rows, slopes)
         name = "poses" if self.whole else "positions"
         return Options(rows, slopes, self._new(scene, slopes @ shared), noise, torch.zeros_like(rows), (name,))
-
-    @property
-    def of_positions(self) -> bool:
-        """Of markers or origins."""
-        return True
-
-    @property
-    def of_frames(self) -> bool:
-        """Poses."""
-        return self.whole
 
 
 @dataclass(frozen=True)

@@ -25,23 +25,20 @@ MOST_NUMBERS = 2
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     """Sensors that measured the rows of a model, devices of readings and sockets where the fit found them.
 
-    Where the model does not know its devices (files of old versions, and registered models) they are read off the map,
-    which keeps the slopes of its rows and the effects of its devices.
+    Raises:
+        InputError: files of early versions, which do not say where devices of readings are.
     """
-    fitted, q, known = model.map, model.configurations, _known_devices(model)
-    shared = fitted.noise.shared
+    q, shared, known = model.configurations, model.map.noise.shared, _known_devices(model)
     measured, read, resting = _rows_by_sensor(model)
     found: list[Sensor] = [Positions(whole=model.lever is not None)] if bool(measured.any()) else []
     found += [camera for own in model.placement for camera in board_images(model, own)]
     if bool(resting.any()):
         found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
     moved = (shared != 0).any(1)  # (N, c) unknowns of a row
-    if known:
-        return (*found, *(_known(model, rows, devices, moved) for rows, devices in known))
-    for own in moved[read].unique(dim=0) if bool(read.any()) else ():
-        rows = (moved == own).all(1) & read
-        found.append(_device(model, (rows, own), _name(model, rows)))
-    return tuple(found)
+    if bool(read.any()) and not known:
+        fix = "say by `sensor` what will measure"
+        raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)
+    return (*found, *(_known(model, rows, devices, moved) for rows, devices in known))
 
 
 def without_positions(model: CalibratedKinematics) -> bool:
@@ -137,42 +134,7 @@ def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
     return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
 
 
-def _name(model: CalibratedKinematics, rows: Tensor) -> str:
-    """Name of the device that measured some rows (N,) of a fit, after its kind where another kind has the same name.
-
-    Files of old versions hold no names.
-    """
-    first = int(rows.nonzero()[0, 0])
-    for own in model.placement:
-        for name, row in zip([own.names[number] for number in own.device.tolist()], own.rows.tolist(), strict=True):
-            if row == first:
-                return _called(model, own, own.names.index(name))
-    return f"device of row {first}"
-
-
 def _called(model: CalibratedKinematics, own: PlacedDevices, number: int) -> str:
     """Name of a device, after its kind where another kind has the same name."""
     name = own.names[number]
     return name if sum(name in other.names for other in model.placement) == 1 else f"{own.kind} {name}"
-
-
-def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], name: str) -> DeviceReadings:
-    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects."""
-    (rows, columns), fitted = own, model.map
-    if fitted.slopes is None:
-        raise InputError.of("a model of readings", expected="slopes of its rows")
-    numbers, ball = fitted.noise.visible[rows][0], model(model.configurations[rows]).detach()[:, -1]
-    slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
-    for kind in known_kinds().values():
-        deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
-        if len(deviations) != effects.shape[2]:
-            continue
-        constants = kind.seen_by(slopes, effects / deviations, ball)
-        if constants is None:
-            continue
-        devices = kind((name,), constants[None], deviations)
-        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
-        if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
-            return DeviceReadings(None, devices, columns, _noise(model, rows))
-    fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
-    raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)
