@@ -93,17 +93,17 @@ class BoardImages(Sensor):
 
 def board_images(model: CalibratedKinematics, placed: PlacedDevices) -> list[Sensor]:
     """Those of the cameras of a fit; none of other devices."""
-    return [_of_camera(model, placed, number, seen) for number, seen in enumerate(placed.cameras.values())]
+    each = enumerate(placed.cameras.items())
+    return [_of_camera(model, name, seen, placed.rows[placed.device == k]) for k, (name, seen) in each]
 
 
-def _of_camera(model: CalibratedKinematics, placed: PlacedDevices, number: int, seen: BoardCamera) -> BoardImages:
-    """One camera, where it stood last."""
-    rows, noise = placed.rows[placed.device == number], model.map.noise
-    set_up = SetUp.of(model, _last_session(model, rows) or _own_place(model, placed.names[number]))
-    found = BoardImages(None, placed.names[number], seen, model.bodies.pose_lever(), set_up)
+def _of_camera(model: CalibratedKinematics, name: str, seen: BoardCamera, rows: Tensor) -> BoardImages:
+    """One camera, where it stood last; ``rows`` (M,) of the fit that it measured."""
+    noise, (session, stood) = model.map.noise, _last_session(model, rows, name)
+    set_up = SetUp.of(model, session)
+    found = BoardImages(None, name, seen, model.bodies.pose_lever(), set_up)
     if seen.camera.view is None or model.registration is not None:
         return found
-    stood = _same_session(model, rows)
     points = model(model.configurations[stood]).detach().flatten(1)
     known, by_lens = found.tells(points)
     if not len(stood) or not bool(by_lens.isfinite().all()):  # it was seen from other places since
@@ -118,25 +118,16 @@ def _of_camera(model: CalibratedKinematics, placed: PlacedDevices, number: int, 
     return BoardImages(None, found.name, seen, found.lever, set_up, effects, rest)
 
 
-def _last_session(model: CalibratedKinematics, rows: Tensor) -> str | None:
-    """Name of the session of the last of some rows; None where there are none, and in the place of a registration."""
-    for own in model.placement if model.registration is None else ():
-        if own.kind in TRANSFORMS and len(own.rows):
-            here = torch.isin(own.rows, rows)
-            return own.names[int(own.device[here][own.rows[here].argmax()])] if bool(here.any()) else None
-    return None
+def _last_session(model: CalibratedKinematics, rows: Tensor, camera: str) -> tuple[str | None, Tensor]:
+    """Name of the session of the last of a camera's rows (M,), and those of it.
 
-
-def _own_place(model: CalibratedKinematics, camera: str) -> str | None:
-    """Name of the last set-up of one of several cameras, where no row says it: that of a recalibration."""
-    sets = () if model.registration is not None else (own for own in model.placement if own.kind in TRANSFORMS)
-    return next((name for own in sets for name in reversed(own.names) if name.partition("/")[0] == camera), None)
-
-
-def _same_session(model: CalibratedKinematics, rows: Tensor) -> Tensor:
-    """Those of some rows that are of the session of the last one."""
-    name = _last_session(model, rows)
-    for own in model.placement if name is not None else ():
-        if own.kind in TRANSFORMS:
-            return rows[torch.isin(rows, own.rows[own.device == own.names.index(name)])]
-    return rows
+    Where no row says it, that of its last set-up, by a recalibration; None in the place of a registration.
+    """
+    sets = [own for own in model.placement if own.kind in TRANSFORMS] if model.registration is None else []
+    for own in sets:
+        here = torch.isin(own.rows, rows)
+        if bool(here.any()):
+            number = int(own.device[here][own.rows[here].argmax()])
+            return own.names[number], rows[torch.isin(rows, own.rows[own.device == number])]
+    names = (name for own in sets for name in reversed(own.names) if name.partition("/")[0] == camera)
+    return next(names, None), rows

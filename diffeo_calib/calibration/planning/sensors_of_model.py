@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -14,7 +15,6 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import known_kinds
-from diffeo_calib.sensors.places import PlacedDevices
 
 SAME_SLOPES = 0.05
 """Largest difference of slopes of a device that was recognised, relative to those of a distance."""
@@ -28,17 +28,21 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     Raises:
         InputError: files of early versions, which do not say where devices of readings are.
     """
-    q, shared, known = model.configurations, model.map.noise.shared, _known_devices(model)
+    q, shared, known = model.configurations, model.map.noise.shared, list(_known_devices(model))
     measured, read, resting = _rows_by_sensor(model)
-    found: list[Sensor] = [Positions(whole=model.lever is not None)] if bool(measured.any()) else []
-    found += [camera for own in model.placement for camera in board_images(model, own)]
-    if bool(resting.any()):
-        found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
-    moved = (shared != 0).any(1)  # (N, c) unknowns of a row
-    if bool(read.any()) and not known:
+    unknown = bool(read.any()) and not known
+    if unknown and model.registration is None:
         fix = "say by `sensor` what will measure"
         raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)
-    return (*found, *(_known(model, rows, devices, moved) for rows, devices in known))
+    found: list[Sensor] = [Positions(whole=model.lever is not None)] if bool(measured.any()) or unknown else []
+    found += [camera for own in model.placement for camera in board_images(model, own)]
+    if bool(resting.any()):
+        ball, effects = model(q[resting]).detach()[:, -1], shared[resting, -3:]
+        _, which = effects.flatten(1).unique(dim=0, return_inverse=True)
+        rows = [which == number for number in range(int(which.max()) + 1)]
+        first = torch.stack([effects[own][0] for own in rows])
+        found.append(InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first))
+    return (*found, *known)
 
 
 def without_positions(model: CalibratedKinematics) -> bool:
@@ -68,39 +72,26 @@ def _rows_by_sensor(model: CalibratedKinematics) -> tuple[Tensor, Tensor, Tensor
     return ~read & ~resting & ~imaged, read & ~imaged, resting
 
 
-def _known(model: CalibratedKinematics, rows: Tensor, devices: Devices, moved: Tensor) -> DeviceReadings:
-    """A device with the rows (M,) of the fit that it measured, and (N, c) the unknowns of every row.
-
-    Of one that measured none nothing is known but its rough place.
-    """
-    if not len(rows):
-        return DeviceReadings(None, devices, around=True)
-    return DeviceReadings(None, devices, moved[rows].any(0), _noise(model, rows))
-
-
-def _noise(model: CalibratedKinematics, rows: Tensor) -> Tensor:
-    """(r, r) noise of the readings of a device by its rows (M,) of the fit, m^2."""
-    noise = model.map.noise
-    numbers = noise.visible[rows][0]
-    return noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
-
-
-def _known_devices(model: CalibratedKinematics) -> list[tuple[Tensor, Devices]]:
-    """Every device of readings of a model by itself, and the rows (M,) of the fit that it measured, if any."""
-    found, noise, taken = [], model.map.noise, list[Tensor]()
+def _known_devices(model: CalibratedKinematics) -> Iterator[DeviceReadings]:
+    """Every device of readings of a model by itself; of one that measured no row only its rough place is known."""
+    noise, taken = model.map.noise, list[Tensor]()
+    moved = (noise.shared != 0).any(1)  # (N, c) unknowns of a row
     for one in model.placement:
-        for number in range(len(one.names)) if one.devices is not None else ():
-            kind, name = known_kinds()[one.kind], _called(model, one, number)
+        for number, word in enumerate(one.names if one.devices is not None else ()):
+            kind, several = known_kinds()[one.kind], sum(word in other.names for other in model.placement) > 1
             rows = one.rows[one.device == number].to(noise.shared.device)
-            device = kind((name,), one.constants[number, None], one.deviations[number])
+            name = f"{one.kind} {word}" if several else word
+            device = kind((name,), one.constants[number, None], one.constants.new_tensor(kind.prior()))
             rows = rows if len(rows) else _unnamed_rows(model, device, taken)
-            offset = 0.0
-            if len(rows):
-                taken.append(rows)
-                effects = noise.shared[rows[0], noise.visible[rows[0]]]
-                offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
-            found.append((rows, replace(device, deviations=one.constants.new_tensor(kind.prior(offset)))))
-    return found
+            if not len(rows):
+                yield DeviceReadings(None, device, around=True)
+                continue
+            taken.append(rows)
+            numbers = noise.visible[rows[0]]
+            effects, own = noise.shared[rows[0], numbers], noise.covariance[rows][:, numbers][:, :, numbers]
+            offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
+            device = replace(device, deviations=one.constants.new_tensor(kind.prior(offset)))
+            yield DeviceReadings(None, device, moved[rows].any(0), own.median(0).values)
 
 
 def _unnamed_rows(model: CalibratedKinematics, device: Devices, taken: list[Tensor]) -> Tensor:
@@ -124,17 +115,3 @@ def _unnamed_rows(model: CalibratedKinematics, device: Devices, taken: list[Tens
         if same and int(own.sum()) in unknowns:
             return rows
     return none
-
-
-def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
-    """The sockets of a fit by its rows: places (N, 3) of the ball, m, and effects (N, 3, c)."""
-    _, which = effects.flatten(1).unique(dim=0, return_inverse=True)
-    rows = [which == number for number in range(int(which.max()) + 1)]
-    first = torch.stack([effects[own][0] for own in rows])
-    return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
-
-
-def _called(model: CalibratedKinematics, own: PlacedDevices, number: int) -> str:
-    """Name of a device, after its kind where another kind has the same name."""
-    name = own.names[number]
-    return name if sum(name in other.names for other in model.placement) == 1 else f"{own.kind} {name}"
