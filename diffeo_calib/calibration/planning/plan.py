@@ -343,7 +343,7 @@ def _known_rms(given: Tree | CalibratedKinematics, scene: Scene, known: Known, r
 
 def _noise_rms(scene: Scene, sensors: Sequence[Sensor], targets: Tensor) -> float:
     """RMS noise of a measured position, m: of the first sensor with positions of a stated deviation, or of the rows."""
-    stated = next((one.std for one in sensors if isinstance(one, Positions) and one.std is not None), None)
+    stated = next((one.std for one in sensors if one.of_positions and one.std is not None), None)
     noise = scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
     return float(3 * noise) ** 0.5 if stated is None else 3**0.5 * stated
 
@@ -390,9 +390,8 @@ def _start(
     """
     robot, free = given
     near, known, q = groups
-    positions = [sensor for sensor in own[2] if isinstance(sensor, Positions)]
     if isinstance(robot, Tree):
-        frames = any(sensor.whole for sensor in positions)
+        frames = any(sensor.of_frames for sensor in own[2])
         tool = tool_of(robot, torch.eye(4, dtype=q.dtype, device=q.device) if own[0] is None and frames else own[0])
     elif robot.map.registration is not None and free is None:  # its rows tell where the device stands
         known = torch.cat([known, robot.map.registration.q.to(q.device)])
@@ -401,7 +400,7 @@ def _start(
         near = near[torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=q.device).round().long()]
     every = torch.cat([near, known, q])
     if isinstance(robot, Tree):
-        start = of_robot(robot, tool, every, near, own[1], adrift=not positions)
+        start = of_robot(robot, tool, every, near, own[1], adrift=not any(sensor.of_positions for sensor in own[2]))
     else:
         start = of_model(robot, every, free)
     return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -136,6 +136,8 @@ class Sensor(ABC):
     """
 
     std: float | None = None
+    of_positions: ClassVar[bool] = False
+    """Whether errors of held-out rows are errors of positions."""
 
     def __post_init__(self) -> None:
         if self.std is not None:
@@ -195,6 +197,11 @@ class Sensor(ABC):
         """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
         return []
 
+    @property
+    def of_frames(self) -> bool:
+        """Whether it measures frames, not markers."""
+        return False
+
     @staticmethod
     def _new(scene: Scene, shared: Tensor) -> Tensor:
         """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
@@ -222,10 +229,16 @@ class Positions(Sensor):
 
     whole: bool = False
     new: bool = False
+    of_positions: ClassVar[bool] = True
 
     def beside_others(self) -> Sensor:
         """See :meth:`Sensor.beside_others`."""
         return replace(self, new=True)
+
+    @property
+    def of_frames(self) -> bool:
+        """Poses."""
+        return self.whole
 
     def options(self, scene: Scene) -> Options:
         """At every configuration. The place of a new device is unknown, and where nothing says where the robot is."""
