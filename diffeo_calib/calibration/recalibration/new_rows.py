@@ -25,7 +25,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
@@ -136,10 +136,20 @@ class NewRows:
     @cached_property
     def shifts(self) -> Tensor:
         """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
-        places = self.seen[0].unflatten(1, (-1, 3))
-        around = {"centre": self.centre, "marker_deviation": self.marker_deviation}
-        found = device_shifts(self.before, self.points, self.seen[1], places=places, **around)
+        deformation = self.fitted.geodesic.with_nominal(self.points)
+        places, free = self.seen[0].unflatten(1, (-1, 3)), self.marker_deviations
+        found = place_columns(deformation, self.seen[1], places, self.centre, frame=self.frame_deviation, free=free)
         return torch.cat([found if self.slopes is None else self.slopes @ found, self.by_devices], 2)
+
+    @property
+    def frame_deviation(self) -> float:
+        """Prior deviation of the measuring frame, m and rad: it may have moved where a device measured coordinates."""
+        return 0.0 if self.before.place is None else PLACES.found_m_rad
+
+    @property
+    def marker_deviations(self) -> Tensor:
+        """(3 P,) those of the markers, m: of those that old and new rows show."""
+        return self.marker_deviation * self.before.seen_before.repeat_interleave(3).to(self.y)
 
     @cached_property
     def by_devices(self) -> Tensor:
@@ -397,25 +407,3 @@ def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
 def usual_variance(noise: Noise) -> float:
     """Median variance of the numbers that were measured, m^2."""
     return float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].median())
-
-
-def device_shifts(
-    before: Before, points: FlangePoints, at: Linearisation, *, places: Tensor, centre: Tensor, marker_deviation: float
-) -> Tensor:
-    """Effect of shifts and turns of the measuring device about a centre, and of the markers on the flange.
-
-    Only where a device measured coordinates its frame may have moved, and of the markers those that were seen.
-
-    Args:
-        before: the old map, and what may have moved. points: nominal map of the markers.
-        at: the old map around these, at N configurations.
-        places: (N, P, 3) where they are, m. centre: (3,) m. marker_deviation: prior standard deviation, m.
-
-    Returns:
-        (N, 3 P, c) columns of unit prior variance, m.
-    """
-    moving = before.seen_before.repeat_interleave(3)
-    markers = marker_deviation * marker_slopes(before.fitted.geodesic, points, at)[..., moving]
-    if before.place is None:
-        return markers
-    return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)
