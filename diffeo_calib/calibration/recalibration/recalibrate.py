@@ -2,7 +2,7 @@
 
 1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
 2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
-3 changes     what else has changed: named parts may drift (changes.py), and everything a little (drift.py)
+3 changes     what else has changed: named parts may drift (changes.py), and everything a little (usual_drift.py)
 4 fit         the exact model of old and new rows, with the old scales (both_dates.py)
 """
 

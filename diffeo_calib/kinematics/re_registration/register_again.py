@@ -89,8 +89,8 @@ def register_again(
     registration, fit = found.registration, model.unregistered
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
-    teaches = found.part.known and not registration.doubtful and _known(registration) < LARGEST_M_RAD
-    if not (learn and teaches):
+    open_by = max(float(registration.frame_deviations.max()), registration.known_m)
+    if not (learn and found.part.session.same and open_by < LARGEST_M_RAD) or registration.doubtful:
         placed = moved(fit, registration.transform).inflated(found.best.inflation)
         return RegisteredMap(placed, registration), registration
     learnt = moved(_learnt(fit, nominal, found), found.best.T)
@@ -103,11 +103,6 @@ LARGEST_M_RAD = 0.03
 """Deviation of a place, m or rad, from which its rows teach nothing about the robot: to first order they would."""
 STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
 """The first one is within 2 % of the optimum, the second within 0.1 %."""
-
-
-def _known(found: Registration) -> float:
-    """Largest standard deviation of a place, m or rad."""
-    return max(float(found.frame_deviations.max()), found.known_m)
 
 
 def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMap:
@@ -131,8 +126,10 @@ def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMa
         centre=session.centre,
     )
     problem, start = both_dates(fit, nominal, new, [], best.inflation)
-    momenta = STEPS.solve(problem, fit.geodesic.integrator, start).momenta
-    return problem.calibrated(problem.deform(momenta, fit.geodesic.integrator))
+    solution = STEPS.solve(problem, fit.geodesic.integrator, start)
+    if solution.interrupted:
+        raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
+    return problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
 
 
 class FoundPlace(NamedTuple):
@@ -165,7 +162,8 @@ def find_place(
     """
     _check_arguments(nominal, data, free, marker_std)
     data = data.to(HOST)
-    some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
+    evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
+    some = data if len(data) <= MOST_ROWS else data.rows(evenly)
     nominal = nominal.under(some.payload)
     model = model.with_nominal(nominal)
     every = session_of(model, nominal, lever, some, free, ball=ball)
@@ -264,10 +262,6 @@ def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker
     chain.joint_values(data.to(HOST).q)
     if marker_std is not None:
         check_number(marker_std, "`marker_std`, in m", above=0.0)
-
-
-def _evenly(rows: int, count: int) -> list[int]:
-    return [round(k * (rows - 1) / (count - 1)) for k in range(count)]
 
 
 def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float, ...]:
@@ -454,11 +448,9 @@ def _scales(found: Estimate, without: Tensor, coordinates: Tensor) -> tuple[Tens
 def _falls(found: Estimate, sets: Tensor) -> Tensor:
     """Fall of the quadratic form without each set of rows: (K, size) -> (K,)."""
     m = found.rows.residual.shape[1]
-    S = found.rows.slopes.flatten(0, 1)[:, found.free]
-    mu = found.precision @ (found.rows.residual.flatten() - S @ found.mean)
     places = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-    blocks = found.precision[places[:, :, None], places[:, None, :]]
-    chosen = mu[places]
+    blocks = found.factor.inverse[places[:, :, None], places[:, None, :]]
+    chosen = found.solved[places]
     return (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
 
 
