@@ -37,7 +37,6 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
-from diffeo_calib.sensors.set_ups import frame_slopes
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
