@@ -106,9 +106,11 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "task_dim": spec.task_dim,
         "integrator": deformation.integrator.to_config(),
     }
-    if seen.registration is not None:
-        header["registration"], found = describe_registration(seen.registration)
-        tensors |= found
+    found = model.registration
+    if found is not None:
+        header["registration"], arrays = describe_registration(found)
+        header["registration"] |= {LEARNT: True} if seen.registration is None else {}
+        tensors |= arrays
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
@@ -192,12 +194,16 @@ def rebuild(
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     known = {attribute: tensors.get(name) for name, attribute in MAP_TENSORS.items()}
     fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), new_noise=new_noise, **known)
+    learnt = None
     if "registration" in header:
-        fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
+        found = rebuild_registration(header["registration"], tensors, x.shape[1])
+        learnt = found if LEARNT in header["registration"] else None
+        fitted = fitted if learnt else RegisteredMap(fitted, found)
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
         given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
         given |= {name: tensors.get(name) for name in ROBOT_TENSORS}
+        given["learnt"] = learnt
         given["ball"] = header.get("ball", False) is True
         given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
@@ -395,6 +401,8 @@ SHIFT = "shift"
 NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
 UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
 ENTRIES = {*NUMBERS, "same", "free", "outliers", "undetermined", SHIFT}
+LEARNT = "learnt"
+"""The entry of a registration whose rows the map knows as those of a fit: no map around another one."""
 
 
 def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -411,7 +419,7 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
     Raises:
         InputError: entries that are missing or do not fit together.
     """
-    if not isinstance(entry, dict) or set(entry) != ENTRIES:
+    if not isinstance(entry, dict) or set(entry) - {LEARNT} != ENTRIES:
         got = sorted(entry) if isinstance(entry, dict) else entry
         raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
     for name in NUMBERS:

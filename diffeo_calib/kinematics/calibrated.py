@@ -25,7 +25,7 @@ from diffeo_calib.kinematics.re_registration.register_again import (
     registered_devices,
     registration_rows,
 )
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.bodies import bodies_of
@@ -55,8 +55,7 @@ class CalibratedKinematics:
         summary: numbers and sentences about the calibration that are saved with the model; None without one.
         lever: for a model that was calibrated with poses, the distance in m of the three points of each from the origin
             of the measured frame; see :meth:`Measurements.from_poses`.
-        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
-            is not given another; the tip itself by default.
+        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, of :meth:`tool_poses`; else the tip.
         tool_tip: name of the tip that carries it, for a robot with several.
         rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
@@ -64,6 +63,7 @@ class CalibratedKinematics:
         ball: whether the last marker is a ball whose position no device measured; so it is if none was measured at all.
         placement: devices of the fit in unknown places: measuring frames of sessions, sockets, devices of readings.
         scales: scales of kernels, priors and noise as one vector, see ``Hyperparameters.vector``; None if unknown.
+        learnt: the registration whose rows the map knows as those of a fit; None without one.
 
     Raises:
         InputError: a lever that is not positive, or one for a number of points that is no multiple of three; error
@@ -84,6 +84,7 @@ class CalibratedKinematics:
         ball: bool = False,
         placement: tuple[PlacedDevices, ...] = (),
         scales: Tensor | None = None,
+        learnt: Registration | None = None,
     ) -> None:
         self.bodies = bodies_of(lever)
         self.bodies.check_points(map.m // 3)
@@ -99,6 +100,7 @@ class CalibratedKinematics:
         self.ball = ball or map.workspace is not None
         self.placement = placement
         self.scales = scales
+        self.learnt = learnt
 
     @property
     def has_tool(self) -> bool:
@@ -168,16 +170,16 @@ class CalibratedKinematics:
         Args:
             fitted: its map. provenance: where it comes from. ball: see the class; as before by default.
         """
-        changes = {"map": fitted, "provenance": provenance, "placement": ()}
+        changes = {"map": fitted, "provenance": provenance, "placement": (), "learnt": None}
         return self._with(**changes, ball=self.ball if ball is None else ball)
 
     def registered(
-        self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
+        self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None, learn: bool = True
     ) -> CalibratedKinematics:
         """The same robot seen by a device that has moved, with markers that have moved or other ones.
 
-        From 4 to 10 poses the measuring frame and the markers are found anew; everything else is kept. Outliers take no
-        part, predictions include what is not known about the new places, and of more than 200 rows 200 are used.
+        From 4 to 10 poses the measuring frame and the markers are found anew, and what the rows say of the robot is
+        learnt. Outliers take no part, predictions include what is not known, and of more than 200 rows 200 are used.
 
         Args:
             measurements: N configurations with markers or poses in the new measuring frame; of several sessions the
@@ -187,8 +189,9 @@ class CalibratedKinematics:
                 new devices are placed around the robot. Devices that the model knows and that have no rows here stay
                 where they are.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
-            marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
-                decide between the same place, a small motion and other markers.
+            marker_std: deviation of the markers from their old places on the flange, m; by default the rows decide.
+            learn: False finds places alone, for rows that judge the robot afterwards. So it is where rows contradict
+                the model, leave a place open, or show another number of markers.
 
         Returns:
             the model in the new measuring frame; its :attr:`registration` says what was found.
@@ -208,16 +211,17 @@ class CalibratedKinematics:
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
         ball = self.ball and bool(rows.points[:, -1].isnan().all())
-        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std, ball=ball)
-        known = {"map": found.to(self.configurations.device), "lever": found.registration.lever, "placement": ()}
-        seen = self._with(**known, ball=ball)._carrying(self.nominal.load)
+        asked = {"free": free, "marker_std": marker_std, "ball": ball, "learn": learn}
+        placed, found = register_again(model.map, model.nominal, self.lever, rows, **asked)
+        known = {"map": placed.to(self.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
+        seen = self._with(**known, learnt=None if placed.registration else found)._carrying(self.nominal.load)
         seen = seen._with(placement=registered_devices(self, seen))
         return seen._with(placement=devices_beside(seen, measurements))
 
     @property
     def registration(self) -> Registration | None:
         """Result of the registration; None for a model in the place of its fit."""
-        return self.map.registration
+        return self.learnt or self.map.registration
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
@@ -252,10 +256,7 @@ class CalibratedKinematics:
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        nominal = self.map.unregistered.deformation.spec.nominal
-        if not isinstance(nominal, GeometryMap):
-            raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
-        return nominal
+        return robot_map(self.map.unregistered)
 
     def transmission(self, joint: str, values: object) -> Tensor:
         """Transmission error of one joint as a function of its own value, to first order in the deformation.
@@ -487,8 +488,8 @@ class CalibratedKinematics:
 
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        names = ["robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball"]
-        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement", "scales"]} | changes)
+        known = {name: value for name, value in vars(self).items() if name != "bodies"}
+        return CalibratedKinematics(**known | changes)
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

@@ -71,7 +71,7 @@ def covered(model: dc.CalibratedKinematics, data: dc.Measurements) -> float:
 def test_a_model_seen_from_elsewhere_is_exact(name: str, request: pytest.FixtureRequest) -> None:
     case, T = request.getfixturevalue(name), transform(1)
     model, q = case.model, case.test.q[:20]
-    there = dc.CalibratedKinematics(case.robot, moved(model.map, model.nominal, T), lever=model.lever)
+    there = dc.CalibratedKinematics(case.robot, moved(model.map, T), lever=model.lever)
     torch.testing.assert_close(there(q), by(T, model(q)), rtol=0, atol=1e-12)
     torch.testing.assert_close(there.jacobian(q), T[:3, :3] @ model.jacobian(q), rtol=0, atol=1e-12)
     expected = T[:3, :3] @ model.predict(q)[1] @ T[:3, :3].mT
@@ -81,15 +81,18 @@ def test_a_model_seen_from_elsewhere_is_exact(name: str, request: pytest.Fixture
     torch.testing.assert_close(there.predict_tool_poses(q)[1], model.predict_tool_poses(q)[1], rtol=1e-6, atol=1e-13)
 
 
-def test_registration_follows_the_frame(arm: Case) -> None:
+@pytest.mark.parametrize("learn", [True, False])
+def test_registration_follows_the_frame(arm: Case, *, learn: bool) -> None:
     """registered(T @ data) = T @ registered(data), and registrations one after the other reach the same place."""
     rows, T, S, q = slice(0, 8), transform(2), transform(3), arm.test.q[20:30]
-    here = arm.model.registered(seen(arm, rows, torch.eye(4, dtype=torch.float64)), free="base")
-    there = arm.model.registered(seen(arm, rows, T), free="base")
+    here = arm.model.registered(seen(arm, rows, torch.eye(4, dtype=torch.float64)), free="base", learn=learn)
+    there = arm.model.registered(seen(arm, rows, T), free="base", learn=learn)
     torch.testing.assert_close(there(q), by(T, here(q)), rtol=0, atol=1e-9)
     torch.testing.assert_close(record(there).transform, T @ record(here).transform, rtol=0, atol=1e-9)
     torch.testing.assert_close(record(there).frame_deviations.norm(), record(here).frame_deviations.norm())
-    again = there.registered(seen(arm, rows, S @ T), free="base")
+    if learn:
+        return  # the same rows would count twice
+    again = there.registered(seen(arm, rows, S @ T), free="base", learn=False)
     torch.testing.assert_close(again(q), by(S @ T, here(q)), rtol=0, atol=1e-8)
     torch.testing.assert_close(again.predict(q)[1], S[:3, :3] @ there.predict(q)[1] @ S[:3, :3].mT, rtol=0.05, atol=0)
 
@@ -188,6 +191,22 @@ def test_poses_with_another_lever(posed: Case) -> None:
     assert errors.rms < 1.3 * rms(posed.model, posed.test)
 
 
+def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
+    """More rows make it better than places alone, and what they contradict is not learnt."""
+    T, rest = transform(22), slice(60, None)
+    rows = seen(arm, slice(0, 60), T)
+    learnt, placed = (arm.model.registered(rows, learn=learn) for learn in (True, False))
+    assert rms(learnt, seen(arm, rest, T)) < 0.95 * rms(placed, seen(arm, rest, T))
+    assert covered(learnt, seen(arm, rest, T)) > 0.9
+    torch.testing.assert_close(learnt.geometry.tool, record(learnt).markers, rtol=0, atol=0)
+    assert len(learnt.configurations) == len(arm.model.configurations) + 60
+    bent = dc.Measurements(rows.q, rows.points * torch.tensor([1.0, 1.01, 1.0], dtype=torch.float64))
+    with pytest.warns(dc.DiffeoCalibWarning) as told:
+        kept = arm.model.registered(bent)
+    assert any("times as large as the model" in str(one.message) for one in told)
+    assert len(kept.configurations) == len(arm.model.configurations)
+
+
 def test_one_wrong_row_of_eight(arm: Case) -> None:
     T = transform(10)
     data = seen(arm, slice(0, 8), T)
@@ -268,7 +287,7 @@ def test_known_deviations_count(arm: Case) -> None:
 def test_tools_of_a_registered_model(arm: Case) -> None:
     """Inside the base nothing changes; in the measuring frame poses move, and are less certain."""
     T, q, tool = transform(15), arm.test.q[:6], [0.05, 0.0, 0.2]
-    found = arm.model.registered(seen(arm, slice(0, 10), T))
+    found = arm.model.registered(seen(arm, slice(0, 10), T), learn=False)
     torch.testing.assert_close(found.tool_poses(q, tool), arm.model.tool_poses(q, tool), rtol=0, atol=1e-11)
     inside = [model.predict_tool_poses(q, tool)[1] for model in (found, arm.model)]
     torch.testing.assert_close(*inside, rtol=1e-5, atol=1e-13)
@@ -308,7 +327,7 @@ def test_covariances_stay_positive(arm: Case, *, new: bool) -> None:
     if new:
         points = model.tool_poses(q[:12], NEW_MARKER[0].tolist(), frame="measuring")[:, None, :3, 3]
     exact = dc.Measurements(q[:12], points, arm.robot.joint_names)
-    covariance = model.registered(exact).predict(q, noise=False)[1]
+    covariance = model.registered(exact, learn=False).predict(q, noise=False)[1]
     alone = model.predict(q, noise=False)[1]
     least = torch.linalg.eigvalsh(covariance).amin()
     assert float(least) > 0.1 * float(torch.linalg.eigvalsh(alone).amin())

@@ -247,7 +247,7 @@ def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Te
     virtual = Measurements.of_points(q, other(q), None, other.lever).with_load(own.nominal.load)
     fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
-    return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
+    return RegisteredMap(moved(fitted, found.transform), found)
 
 
 def _common_configurations(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import log, nan
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +25,8 @@ from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.re_registration.estimate import row_blocks
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
@@ -36,7 +37,6 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
-from diffeo_calib.sensors.set_ups import frame_slopes
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
@@ -47,16 +47,6 @@ NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cp
 """Factors on the variance of the noise of devices that the old fit does not know."""
 NOISE_EFOLDS = 2.0
 """Prior standard deviation of their logarithm: wide."""
-
-
-class Measured(NamedTuple):
-    """New rows in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
-
-    y: Tensor
-    noise_model: NoiseModel
-    noise: Tensor
-    observe: Observation | None
-    placement: Placement
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +85,18 @@ class NewRows:
         """
         points = FlangePoints(before.at_rows, markers, same=True)
         seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
-        found = measured(before, seen)
-        tails = Tails.none(len(seen), found.noise_model.bodies, device=seen.device)
-        own = before.data.q, found.y, found.noise_model, points, found.noise, marker_deviation, tails
-        return cls(before, *own, found.observe, found.placement)
+        model, noise, known = _measured(before, seen)
+        tails = Tails.none(len(seen), model.bodies, device=seen.device)
+        return cls(
+            before,
+            before.data.q,
+            noise_model=model,
+            points=points,
+            noise=noise,
+            marker_deviation=marker_deviation,
+            tails=tails,
+            **known,
+        )
 
     def __len__(self) -> int:
         return len(self.q)
@@ -136,10 +134,20 @@ class NewRows:
     @cached_property
     def shifts(self) -> Tensor:
         """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
-        places = self.seen[0].unflatten(1, (-1, 3))
-        around = {"centre": self.centre, "marker_deviation": self.marker_deviation}
-        found = device_shifts(self.before, self.points, self.seen[1], places=places, **around)
+        deformation = self.fitted.geodesic.with_nominal(self.points)
+        places, free = self.seen[0].unflatten(1, (-1, 3)), self.marker_deviations
+        found = place_columns(deformation, self.seen[1], places, self.centre, frame=self.frame_deviation, free=free)
         return torch.cat([found if self.slopes is None else self.slopes @ found, self.by_devices], 2)
+
+    @property
+    def frame_deviation(self) -> float:
+        """Prior deviation of the measuring frame, m and rad: it may have moved where a device measured coordinates."""
+        return 0.0 if self.before.place is None else PLACES.found_m_rad
+
+    @property
+    def marker_deviations(self) -> Tensor:
+        """(3 P,) those of the markers, m: of those that old and new rows show."""
+        return self.marker_deviation * self.before.seen_before.repeat_interleave(3).to(self.y)
 
     @cached_property
     def by_devices(self) -> Tensor:
@@ -164,16 +172,24 @@ class NewRows:
         return self.noise_model.weighted(self.noise, self.tails)
 
     @cached_property
-    def covariance(self) -> Tensor:
-        """(M m, M m) of the residuals, m^2."""
-        return Noise(self.weighted_noise).add_to(self.posterior)
+    def factor(self) -> Tensor:
+        """Cholesky factor of the covariance (M m, M m) of the residuals."""
+        return torch.linalg.cholesky(Noise(self.weighted_noise).add_to(self.posterior))
+
+    @cached_property
+    def solved(self) -> Tensor:
+        """(M, m, 1) covariance^-1 r."""
+        return torch.cholesky_solve(self.residual.reshape(-1, 1), self.factor).view(*self.y.shape, 1)
+
+    @cached_property
+    def precisions(self) -> Tensor:
+        """(M, m, m) blocks of covariance^-1: of each row's error as the old model and all other rows predict it."""
+        return row_blocks(torch.cholesky_inverse(self.factor), len(self))
 
     @property
     def log_evidence(self) -> float:
         """log N(r; 0, covariance), but for a constant."""
-        factor, r = torch.linalg.cholesky(self.covariance), self.residual.flatten()[:, None]
-        white = torch.linalg.solve_triangular(factor, r, upper=False)
-        return float(-0.5 * white.square().sum() - factor.diagonal().log().sum())
+        return float(-0.5 * (self.residual * self.solved[..., 0]).sum() - self.factor.diagonal().log().sum())
 
     def with_weights(self) -> NewRows:
         """The same rows with the weights of Student's t, by expectation maximisation."""
@@ -223,9 +239,7 @@ class NewRows:
     @property
     def left_out(self) -> Tensor:
         """(M, m) how far each row is from its prediction by the old model and the other rows, m; NaN where hidden."""
-        inverse, own = self._inverse()
-        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
-        errors = torch.linalg.solve(own, mu)[..., 0]
+        errors = torch.linalg.solve(self.precisions, self.solved)[..., 0]
         return errors.masked_fill(~self.noise_model.coordinates(errors), nan)
 
     @property
@@ -252,28 +266,18 @@ class NewRows:
         The scales were chosen for another session, with few rows of other places, temperatures or loads. The errors of
         every new row as predicted by the old model and all others judge them, see :func:`region_scale`.
         """
-        inverse, own = self._inverse()
-        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
-        covariance = torch.linalg.inv(own)
-        error, noise = covariance @ mu, self.noise
+        covariance, noise = torch.linalg.inv(self.precisions), self.noise
+        error = covariance @ self.solved
         if self.observe is None and self.fitted.slopes is None:
             noise = noise * (self.new_noise.trace() / self._mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
         return max(1.0, region_scale(squares, self.noise_model.freedom, prior=OTHER_DATE))
 
-    def _inverse(self) -> tuple[Tensor, Tensor]:
-        """covariance^-1 (M m, M m) and its blocks (M, m, m)."""
-        M, m = self.y.shape
-        inverse, index = torch.linalg.inv(self.covariance), torch.arange(M, device=self.y.device)
-        return inverse, inverse.view(M, m, M, m)[index, :, index, :]
-
     def _expected_squares(self) -> Tensor:
         """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
         noise = self.weighted_noise
-        inverse, own = self._inverse()
-        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
-        error = noise @ mu
-        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
+        error = noise @ self.solved
+        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ self.precisions @ noise)
 
     @cached_property
     def after_placing(self) -> Tensor:
@@ -310,9 +314,8 @@ class NewRows:
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        inverse, own = self._inverse()
-        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
-        squares = (mu.mT @ torch.linalg.solve(own, mu)).flatten() / self.noise_model.coordinates(self.y).sum(1)
+        squares = (self.solved.mT @ torch.linalg.solve(self.precisions, self.solved)).flatten()
+        squares = squares / self.noise_model.coordinates(self.y).sum(1)
         return float(squares.median().sqrt())
 
     def levelled(self, roots: list[Tensor]) -> NewRows:
@@ -341,15 +344,15 @@ def _scaled(noise: Tensor, own: Tensor, factor: float) -> Tensor:
     return root[:, :, None] * noise * root[:, None, :]
 
 
-def measured(before: Before, seen: Tensor) -> Measured:
-    """The rows in the model's frame, the devices around its points (M, 3 P), m."""
+def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[str, Any]]:
+    """How rows in the model's frame were measured, their noise, and what; the devices around its points (M, 3 P), m."""
     told, noise, sets = None, None, list[DeviceSet]()
     if before.coordinates is not None:
         told, noise, sets = _coordinates(before, seen)
     sets += before.sessions
     readings = [_around(one.table, one.rows, seen) for one in before.readings]
     if told is not None and noise is not None and len(told.rows) == len(seen):
-        return Measured(told.y, told.noise_model, noise, None, Placement(tuple(sets)))
+        return told.noise_model, noise, {"y": told.y, "placement": Placement(tuple(sets))}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
     total = torch.diag_embed(torch.full_like(rows.y, usual_variance(before.fitted.noise)))
@@ -358,8 +361,8 @@ def measured(before: Before, seen: Tensor) -> Measured:
     if rows.noise_model.known is not None:
         total = larger(total, rows.noise_model.known)
     model = replace(rows.noise_model, known=None)
-    sets += readings
-    return Measured(rows.y, model, without_hidden(total, visible), rows.observe, Placement(tuple(sets)))
+    known = {"y": rows.y, "observe": rows.observe, "placement": Placement((*sets, *readings))}
+    return model, without_hidden(total, visible), known
 
 
 def _padded(noise: Tensor, size: int) -> Tensor:
@@ -397,25 +400,3 @@ def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
 def usual_variance(noise: Noise) -> float:
     """Median variance of the numbers that were measured, m^2."""
     return float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].median())
-
-
-def device_shifts(
-    before: Before, points: FlangePoints, at: Linearisation, *, places: Tensor, centre: Tensor, marker_deviation: float
-) -> Tensor:
-    """Effect of shifts and turns of the measuring device about a centre, and of the markers on the flange.
-
-    Only where a device measured coordinates its frame may have moved, and of the markers those that were seen.
-
-    Args:
-        before: the old map, and what may have moved. points: nominal map of the markers.
-        at: the old map around these, at N configurations.
-        places: (N, P, 3) where they are, m. centre: (3,) m. marker_deviation: prior standard deviation, m.
-
-    Returns:
-        (N, 3 P, c) columns of unit prior variance, m.
-    """
-    moving = before.seen_before.repeat_interleave(3)
-    markers = marker_deviation * marker_slopes(before.fitted.geodesic, points, at)[..., moving]
-    if before.place is None:
-        return markers
-    return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)

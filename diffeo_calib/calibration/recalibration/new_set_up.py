@@ -25,7 +25,7 @@ from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
@@ -156,14 +156,6 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
     return model.ball or model.map.unregistered.workspace is not None
-
-
-def robot_map(fitted: FittedMap) -> GeometryMap:
-    """The nominal map of a robot's fitted map."""
-    nominal = fitted.geodesic.spec.nominal
-    if not isinstance(nominal, GeometryMap):
-        raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
-    return nominal
 
 
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, TOLD_APART, Change, Changes
-from diffeo_calib.calibration.recalibration.new_set_up import Before, robot_map
+from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -67,7 +67,7 @@ def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[Hidde
     if found is None or changes.found:
         return ()
     old = before.fitted
-    S, J = _slopes(RegisteredMap(moved(old, robot_map(old), found.transform), found), found.q)
+    S, J = _slopes(RegisteredMap(moved(old, found.transform), found), found.q)
     noise = float(found.noise.diagonal().mean().sqrt())
     places = {"the measuring device has moved": (slice(0, 6), _motion(found))}
     if found.shift is not None:

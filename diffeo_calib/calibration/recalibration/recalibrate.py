@@ -1,31 +1,28 @@
 """`recalibrate`: a calibrated model and new rows in a new set-up become one model that knows both.
 
-    1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
-    2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
-    3 changes     what else has changed: named parts may drift (changes.py), and everything a little (drift.py)
-    4 fit         the exact model of old and new rows, with the old scales
-
-The model is that of the robot as it is now. Old rows differ from it by shifts that they share: the places of device and
-markers in their session, and what has drifted since. These are part of their noise (:class:`Noise`): nothing but the
-rows' covariance knows of sessions. The old rows follow from the old momenta (:meth:`FittedMap.measured`).
+1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
+2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
+3 changes     what else has changed: named parts may drift (changes.py), and everything a little (usual_drift.py)
+4 fit         the exact model of old and new rows, with the old scales (both_dates.py)
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from math import log, nan
+from math import nan
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
-from diffeo_calib.calibration.recalibration.fit_both import fit_both, usual_drift
+from diffeo_calib.calibration.recalibration.changes import Drift as PartDrift
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
@@ -34,19 +31,27 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     check_other_table,
     knows_ball,
     place_again,
-    robot_map,
     size_ratio,
     warn_of_moved_markers,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
+from diffeo_calib.calibration.recalibration.usual_drift import usual_drift
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
 from diffeo_calib.common.threads import small_work
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside, warn_about
+from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates
+from diffeo_calib.kinematics.re_registration.register_again import (
+    UNMOVED_LOG_ODDS,
+    carried_devices,
+    devices_beside,
+    warn_about,
+)
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.placement import PLACES
@@ -57,8 +62,6 @@ from diffeo_calib.sensors.set_ups import mounted_of
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
-UNMOVED_LOG_ODDS = log(10.0)
-"""Before the rows are seen: markers that nobody names as moved have not been touched."""
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
 Drift = Literal["tested", "none"]
@@ -189,6 +192,33 @@ def recalibrate(
     return _result(model, before, rows, changes, fitted=fitted, note=note)
 
 
+def fit_both(rows: NewRows, drifts: list[PartDrift], progress: Progress) -> Fit:
+    """The exact model of old and new rows with the old scales."""
+    before, old = rows.before, rows.fitted
+    drifted = list[Tensor]()
+    if drifts:
+        at = old.geodesic.linearise(None if old.data is None else old.x)
+        at = at if old.slopes is None else at.projected(old.slopes)
+        drifted = [each.variance**0.5 * each.part.root(at) for each in drifts]
+    new = NewDate(
+        markers=rows.points.points,
+        payload=rows.points.fitted.payload,
+        q=rows.q,
+        y=rows.y,
+        noise=rows.weighted_noise,
+        seen=rows.noise_model.coordinates(rows.y),
+        shared=rows.by_devices,
+        new_noise=rows.new_noise,
+        frame=rows.frame_deviation,
+        free=rows.marker_deviations,
+        centre=rows.centre,
+        observe=rows.observe,
+    )
+    problem, start = both_dates(old, before.nominal, new, drifted, rows.inflation)
+    solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
+    return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
+
+
 def _result(
     model: CalibratedKinematics, place: Before, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
 ) -> Recalibration:
@@ -198,7 +228,7 @@ def _result(
     if place.stands_free:
         fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
-        fitted_map = moved(fitted_map, robot_map(fitted_map), found.transform)
+        fitted_map = moved(fitted_map, found.transform)
     ball = place.new_ball or (knows_ball(model) and not _ball_measured(place))
     again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)

@@ -169,7 +169,7 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     warn_outside_range(model, data.q)
     for line in another_date_lines(model):
         say(line)
-    found = model.registered(data, free=free)
+    found = model.registered(data, free=free, learn=False)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
     errors = evaluate(found, data)

@@ -38,6 +38,7 @@ from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.process.factor import Factor
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -188,23 +189,20 @@ class Estimate:
     by_fit: Tensor
 
     @cached_property
-    def factor(self) -> Tensor:
-        """Cholesky factor of V."""
-        return torch.linalg.cholesky(self.rows.V)
+    def target(self) -> Tensor:
+        """(M m,) r - S mu."""
+        return self.rows.residual.flatten() - self.rows.slopes.flatten(0, 1)[:, self.free] @ self.mean
 
     @cached_property
-    def white(self) -> tuple[Tensor, Tensor]:
-        """L^-1 S (M m, f) and L^-1 (r - S mu) (M m,)."""
+    def factor(self) -> Factor:
+        """Of V + S P S^T."""
         S = self.rows.slopes.flatten(0, 1)[:, self.free]
-        target = self.rows.residual.flatten() - S @ self.mean
-        both = torch.linalg.solve_triangular(self.factor, torch.cat([S, target[:, None]], 1), upper=False)
-        return both[:, :-1], both[:, -1]
+        return Factor.of(self.rows.V, S @ torch.linalg.cholesky(self.prior))
 
     @cached_property
-    def least(self) -> Tensor:
-        """(P^-1 + S^T V^-1 S)^-1 (f, f), the smallest covariance that an estimate can have."""
-        W, _ = self.white
-        return torch.linalg.inv(torch.linalg.inv(self.prior) + W.mT @ W)
+    def solved(self) -> Tensor:
+        """(M m,) (V + S P S^T)^-1 (r - S mu)."""
+        return self.factor.solve(self.target[:, None])[:, 0]
 
     @cached_property
     def blocks(self) -> Tensor:
@@ -229,8 +227,7 @@ class Estimate:
     @property
     def step(self) -> Tensor:
         """u (f,)."""
-        S = self.rows.slopes.flatten(0, 1)[:, self.free]
-        return self.mean + self.gain @ (self.rows.residual.flatten() - S @ self.mean)
+        return self.mean + self.gain @ self.target
 
     @property
     def student_t_weights(self) -> Tensor:
@@ -242,29 +239,24 @@ class Estimate:
     @property
     def determined(self) -> float:
         """Number of unknowns that the rows determine, between 0 and f."""
-        W, _ = self.white
-        return float((W @ self.least * W).sum())
+        return len(self.free) - float(torch.cholesky_inverse(self.factor.B).trace())
 
     @property
     def quadratic(self) -> float:
         """(r - S mu)^T (V + S P S^T)^-1 (r - S mu)."""
-        W, w = self.white
-        return float(w @ w - w @ (W @ (self.least @ (W.mT @ w))))
+        return float(self.target @ self.solved)
 
     @property
     def log_evidence(self) -> float:
-        """log N(r; S mu, V + S P S^T), but for a constant."""
-        logs = [self.factor.diagonal().log().sum() * 2, torch.logdet(self.prior), -torch.logdet(self.least)]
-        return -0.5 * (self.quadratic + float(torch.stack(logs).sum()))
+        """log N(r; S mu, V + S P S^T)."""
+        return self.factor.log_density(self.target, self.solved)
 
     @cached_property
-    def precision(self) -> Tensor:
-        """(V + S P S^T)^-1 (M m, M m)."""
-        W, _ = self.white
-        eye = torch.eye(len(W), dtype=W.dtype, device=W.device)
-        inverse = torch.linalg.solve_triangular(self.factor, eye, upper=False)
-        part = W.mT @ inverse
-        return inverse.mT @ inverse - part.mT @ self.least @ part
+    def alone(self) -> Tensor:
+        """(M, m, m) what makes the residual of each row one from the place that the others give."""
+        S = self.rows.slopes[..., self.free]
+        own = S @ self.gain.view(len(self.free), len(S), -1).movedim(1, 0)
+        return torch.linalg.inv(torch.eye(own.shape[1], dtype=own.dtype, device=own.device) - own)
 
     @cached_property
     def left_out(self) -> Tensor:
@@ -272,11 +264,8 @@ class Estimate:
 
         NaN where markers are hidden.
         """
-        S = self.rows.slopes[..., self.free]
-        left = self.rows.residual - S @ self.step
-        own = S @ self.gain.view(len(self.free), len(S), -1).movedim(1, 0)  # (M, m, m)
-        eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
-        errors = torch.linalg.solve(eye - own, left[..., None])[..., 0]
+        left = self.rows.residual - self.rows.slopes[..., self.free] @ self.step
+        errors = (self.alone @ left[..., None])[..., 0]
         return errors.masked_fill(~self.rows.visible, nan)
 
     @property
@@ -292,12 +281,9 @@ class Estimate:
 
         The errors that :attr:`left_out` has are linear in those of model and rows, so that their covariance is exact.
         """
-        S, (M, m) = self.rows.slopes[..., self.free], self.rows.residual.shape
-        flat, gain = S.flatten(0, 1), self.gain.view(len(self.free), M, m)
-        eye = torch.eye(m, dtype=S.dtype, device=S.device)
-        alone = torch.linalg.inv(eye - S @ gain.movedim(1, 0))  # (M, m, m)
-        to_error = torch.eye(M * m, dtype=S.dtype, device=S.device) - flat @ self.gain
-        to_error = (alone @ to_error.view(M, m, -1)).flatten(0, 1)
+        flat, (M, m) = self.rows.slopes.flatten(0, 1)[:, self.free], self.rows.residual.shape
+        to_error = torch.eye(M * m, dtype=flat.dtype, device=flat.device) - flat @ self.gain
+        to_error = (self.alone @ to_error.view(M, m, -1)).flatten(0, 1)
         whole = to_error @ (self.rows.V + flat @ self.prior @ flat.mT) @ to_error.mT
         usual = self.blocks / doubt(self.weights)[:, None, None]  # a new row is not doubted
         covariance = row_blocks(whole, M) - self.blocks + usual

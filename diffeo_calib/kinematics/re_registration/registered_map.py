@@ -152,11 +152,8 @@ class RegisteredMap(FittedMap):
     """
 
     def __init__(self, fitted: FittedMap, registration: Registration) -> None:
-        nominal = fitted.deformation.spec.nominal
-        if not isinstance(nominal, GeometryMap):
-            raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         self.fitted, self.registration = fitted, registration
-        self.points = FlangePoints(nominal, registration.markers, same=registration.same)
+        self.points = FlangePoints(robot_map(fitted), registration.markers, same=registration.same)
         noise = registration.noise.to(fitted.deformation.x.device)
         super().__init__(fitted.geodesic.with_nominal(self.points), fitted.noise, fitted.data, noise)
         self.at_registration = self.geodesic
@@ -272,19 +269,41 @@ def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Li
     return (at.by_task_points @ shifts.view(len(at.by_task_points), 3, -1)).view(shifts.shape)
 
 
-def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
+def place_columns(
+    deformation: GeodesicDeformation, at: Linearisation, places: Tensor, centre: Tensor, *, frame: float, free: Tensor
+) -> Tensor:
+    """What rows share where the device's frame and the markers may be elsewhere: (N, 3 P, c), unit variance, m.
+
+    Args:
+        deformation: k1 around :class:`FlangePoints`. at: its linearisation at N configurations. places: (N, P, 3), m.
+        centre: (3,) about which the frame turns, m. frame: its prior deviation, m and rad; 0 where it stays.
+        free: (3 P,) those of the markers' coordinates, m.
+    """
+    points: Any = deformation.spec.nominal
+    markers = (marker_slopes(deformation, points, at) * free)[..., free > 0]
+    return torch.cat([frame * frame_slopes(places, centre), markers], 2) if frame > 0 else markers
+
+
+def robot_map(fitted: FittedMap) -> GeometryMap:
+    """The nominal map of a robot's fitted map; InputError for another map."""
+    nominal = fitted.deformation.spec.nominal
+    if not isinstance(nominal, GeometryMap):
+        raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
+    return nominal
+
+
+def moved(fitted: FittedMap, T: Tensor) -> FittedMap:
     """T o k1.
 
     Args:
-        fitted: k1. nominal: its nominal map. T: (4, 4) rigid transform from the old to the new measuring frame, m.
+        fitted: k1. T: (4, 4) rigid transform from the old to the new measuring frame, m.
 
     Raises:
         InputError: the map is not exact, or its task kernel is not the same in all directions.
     """
-    old = fitted.geodesic
+    old, nominal = fitted.geodesic, robot_map(fitted)
     check_isotropic(old.spec.task_kernel)
-    device = old.x.device
-    geometry = nominal.geometry
+    device, geometry = old.x.device, nominal.geometry
     base = T.to(geometry.base.device) @ geometry.base
     base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
     after = nominal.with_geometry(replace(geometry, base=base))
