@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import seeded
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.process.tails import Tails, reweight
@@ -412,8 +413,13 @@ def least_squares_of(
     """Unknowns u (k,) with the prior N(0, 1) that explain errors (M,) of unit variance; options are those of scipy."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    size = len(errors(u0)) + len(u0)  # raises where the start cannot be measured
+
     def residual(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([errors(torch.from_numpy(u).clone()).numpy(), u])
+        try:
+            return np.concatenate([errors(torch.from_numpy(u).clone()).numpy(), u])
+        except InputError:  # behind a camera: scipy shortens the step
+            return np.full(size, np.inf)
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         return np.concatenate([slopes(torch.from_numpy(u).clone()).numpy(), np.eye(len(u))])

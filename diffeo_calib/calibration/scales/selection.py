@@ -236,8 +236,9 @@ hardly any lever arm in the data."""
 SMALLEST_LOAD_RATIO = 0.05
 """Smallest effect of a family of gravity features, relative to the largest, that its default takes into account."""
 SMALLEST_LEVER = 1e-12
-SMALLEST_HALF_RANGE_M = 5e-3
-"""Of a slide's values; the encoder of one that stands still tells values apart that mean nothing."""
+SMALLEST_HALF_RANGE_M, SMALLEST_RATIO = 5e-3, 50.0
+"""Of a slide's values, and in units of the noise: the encoder of one that stands still tells values apart that mean
+nothing, and a field would fold a shorter kernel's space."""
 SMALLEST_SPREAD_M = 1e-3
 """Of the markers."""
 SMALLEST_LOAD_M = 1e-9
@@ -257,7 +258,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
     amplitude = noise / lever.clamp(min=SMALLEST_LEVER)
     amplitude = amplitude.clamp(max=LARGEST_AMPLITUDE_RATIO * float(amplitude.min()))
     # The metre is no natural unit of a slide: measure it in half-ranges, as a circle in radians.
-    half_range = (0.5 * (x.amax(0) - x.amin(0))).clamp(min=SMALLEST_HALF_RANGE_M)
+    half_range = (0.5 * (x.amax(0) - x.amin(0))).clamp(min=max(SMALLEST_HALF_RANGE_M, SMALLEST_RATIO * noise))
     unit = torch.where(
         torch.tensor(data.space.periodic, dtype=torch.bool, device=x.device), torch.ones_like(half_range), half_range
     )
