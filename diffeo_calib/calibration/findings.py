@@ -24,8 +24,8 @@ from diffeo_calib.sensors.coordinates import errors_of_kinds
 FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
 CHOSEN_FACTOR, UNCHOSEN_FACTOR = 1.6, 16.0
-"""On the squared distance of an outlier, since scales are estimated; where the rows are too few to choose scales defaults
-may be overconfident."""
+"""On the squared distance of an outlier, since scales are estimated; and where the rows are too few to choose scales:
+defaults may be overconfident."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is reported."""
 MOST_CONFIGURATIONS = 8000
