@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
-from diffeo_calib.measurements.checks import unlikely_position_units
+from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import BadCells, TextCells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.tables import to_measurements
@@ -202,7 +202,7 @@ class ReadingColumns(OneLineEach):
         if std is not None:
             _check_positive(rows, self.std, std, "a positive standard deviation", "repair these lines")
         if self.kind == "distance":
-            for text in unlikely_position_units(float(seen.abs().max()), table.length):
+            for text in unlikely_units("positions", float(seen.abs().max()), table.length, "length"):
                 warn_user(f"file '{rows.cells.path}': {text}".replace("positions", "distances"))
         devices = rows.names(self.device, DEVICE, ONE_READING)
         data = self._readings(rows, table, devices, seen, std)
