@@ -25,7 +25,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
-from diffeo_calib.measurements.csv.images import ImageColumns, image_size
+from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -421,9 +421,11 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
         InputError: neither a size nor the file of a camera; several texts one of which is no file.
     """
     names = [text.removeprefix(CORNERS).strip() for text in texts]
-    size = image_size(names[0].split(","))
     if len(names) == 1:
-        return ImageColumns(read_camera(names[0]) if size is None else size, rows.camera_on_tool, rows.session)
+        width, _, height = names[0].partition(",")
+        sized = width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0
+        known = (int(width), int(height)) if sized else read_camera(names[0])
+        return ImageColumns(known, rows.camera_on_tool, rows.session)
     cameras = {Path(name).stem: read_camera(name) for name in names}
     if len(cameras) < len(names):
         fix = "name the file of each camera after the camera in the table, such as left.yaml"

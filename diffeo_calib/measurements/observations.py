@@ -280,15 +280,11 @@ def joined_tables(tables: Sequence[Any]) -> Any:
         found = _observations(pieces)
         part, rows = next(zip(found.parts, found.index, strict=True))
         return found if len(found.parts) > 1 else part.rows(rows.argsort())
+    own = [piece.table for piece in pieces]
     if all(isinstance(table, RowTable) for table in tables):
-        return _in_one(tables)
-    whole = _in_one([piece.table for piece in pieces])
+        return type(tables[0]).in_one(tables)
+    whole = type(own[0]).in_one(own)
     return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
-
-
-def _in_one(tables: Sequence[Any]) -> Any:
-    """Tables of one kind, or of positions and sockets, as one."""
-    return type(tables[0]).in_one(tables)
 
 
 class _Piece(NamedTuple):
@@ -323,7 +319,7 @@ def _observations(pieces: Sequence[_Piece]) -> Observations:
         whole = [_Piece(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
     for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
-    parts = [_in_one([piece.table for piece in group]) for group in groups.values()]
+    parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
     return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
 
 

@@ -71,9 +71,8 @@ class TableFormat:
         check_choice("decimal", self.decimal, (".", ","))
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
-            raise MeasurementError.of(
-                "`sep`", expected="one character", got=as_written(sep), fix="pass ',' or ';' or '\\t'"
-            )
+            fix = "pass ',' or ';' or '\\t'"
+            raise MeasurementError.of("`sep`", expected="one character", got=as_written(sep), fix=fix)
         if sep == self.decimal:
             fix = "pass sep=';' if the numbers have decimal commas"
             got = f"{sep!r} for both"
@@ -112,7 +111,11 @@ class TableFormat:
             MeasurementError: a convention or unit that is missing, unknown or not needed, or a wrong number of names.
         """
         if self.rotation is None:
-            self._check_no_rotation_options()
+            options = ("convention", "rotation_angle", "rotation_std")
+            names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
+            if names or self.camera_on_tool:
+                fix = "name the columns of the rotation too, or leave this out"
+                raise MeasurementError.of(f"{names or '`camera_on_tool`'} without `rotation`", fix=fix)
             return self
         if self.convention is None:
             what = "`rotation` is given, but its `convention` is not"
@@ -146,14 +149,6 @@ class TableFormat:
             given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
             std = _by_frame("rotation_std", given, "three names", 3)
         return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
-
-    def _check_no_rotation_options(self) -> None:
-        options = ("convention", "rotation_angle", "rotation_std")
-        names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
-        names = names or "`camera_on_tool`" * self.camera_on_tool
-        if names:
-            fix = "name the columns of the rotation too, or leave this out"
-            raise MeasurementError.of(f"{names} without `rotation`", fix=fix)
 
     def _check_rotation_unit(self, *, has_angles: bool) -> None:
         """The unit of a rotation must be named where there are angles, and only there."""

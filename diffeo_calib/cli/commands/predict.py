@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.joint_ranges import OutsideRange
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
-from diffeo_calib.measurements.csv.writing import Predictions, write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 Block = TypeVar("Block", bound=Sized)
@@ -78,12 +78,12 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
         check_payload_column(kinematics, table.payload)
     prefixes = kinematics.bodies.prefixes(kinematics)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
-    write = write_pose_predictions if with_poses else write_predictions
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
         blocks = (_predicted(readings, rows.carried_by(kinematics), rows.q) for rows in laden)
-        write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes, more=readings.names)
+        how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
+        write_predictions(output, blocks, table, joints=names, **how)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
