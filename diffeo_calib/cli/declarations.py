@@ -53,11 +53,7 @@ def fit_command(
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
-    files = fit.Outputs(output, given.figure, given.report)
-    how = {"holdout": given.holdout, "seed": given.seed, "controls": given.controls, "note": given.note}
-    how["scales_of"] = others
-    fit.run(links, measured_table(csv, rows, units, duplicates), files, **how)
+    fit.run(robot, measured_table(csv, rows, units, duplicates), output, given)
 
 
 @command("campaign")
@@ -83,11 +79,10 @@ def campaign_command(
         raise InputError.of("--bag and --seen belong together", fix="name both, or none")
     if given.bag is not None and (given.once or given.stdin):
         raise InputError.of("--once and --stdin beside --bag, whose end is that of the campaign", fix="leave them out")
-    from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
+    from diffeo_calib.cli.commands import campaign  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
-    campaign.run(links, measured_table(csv, rows, units), given)
+    campaign.run(robot, measured_table(csv, rows, units), given)
 
 
 @command("record")
@@ -350,11 +345,11 @@ def recalibrate_command(
     units: options.StoredUnits,
     output: options.ModelOutput,
     rows: options.Rows,
-    marker: options.Marker = options.MarkerFreedom.evidence,
+    marker: options.Marker = "evidence",
     drift: Annotated[
         options.Drift,
         typer.Option("--drift", help="tested: what a test names may have changed; none: device and markers only."),
-    ] = options.Drift.tested,
+    ] = "tested",
     seed: options.TestSeed = 0,
     note: options.Note = "",
 ) -> None:
@@ -369,9 +364,7 @@ def recalibrate_command(
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
     from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
-    recalibrate.run(
-        old, TableOptions(csv, rows, units), output, recalibrate.Options(marker.value, drift.value, seed, note)
-    )
+    recalibrate.run(old, TableOptions(csv, rows, units), output, marker=marker, drift=drift, seed=seed, note=note)
 
 
 @command("compare")
@@ -383,7 +376,7 @@ def compare_command(
     ],
     units: options.StoredUnits,
     rows: options.Rows,
-    marker: options.Marker = options.MarkerFreedom.evidence,
+    marker: options.Marker = "evidence",
     level: Annotated[
         float,
         typer.Option(
@@ -415,7 +408,7 @@ def compare_command(
         return
     if figure is not None:
         raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
-    compare.run(old, TableOptions(other, rows, units), marker.value, level, seed)
+    compare.run(old, TableOptions(other, rows, units), marker, level, seed)
 
 
 @command("report")

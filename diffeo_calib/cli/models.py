@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import (
     MeasuredTable,
     TableOptions,
@@ -24,6 +24,8 @@ from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 
@@ -37,6 +39,11 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of(f"{path} is not a robot's model", fix="pass a file written by `diffeo-calib fit`")
     return model
+
+
+def load_robot(given: Robot) -> Tree:
+    """The robot in a URDF."""
+    return load_urdf(given.robot, given.base, list(dict.fromkeys(given.tip)), given.load or ())
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:

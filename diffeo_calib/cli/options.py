@@ -7,9 +7,8 @@ A group of options is a frozen dataclass: a command that has a parameter of this
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -34,64 +33,15 @@ def option(
     return field(metadata=said) if default is ... else field(default=default, metadata=said)
 
 
-class Length(str, Enum):
-    """Unit of positions and prismatic joints."""
-
-    m = "m"
-    mm = "mm"
-
-
-class Angle(str, Enum):
-    """Unit of angles."""
-
-    rad = "rad"
-    deg = "deg"
-
-
-class DH(str, Enum):
-    """Convention of Denavit-Hartenberg tables."""
-
-    standard = "standard"
-    craig = "craig"
-
-
-class Frame(str, Enum):
-    """Frame of targets."""
-
-    base = "base"
-    measuring = "measuring"
-
-
-class ToolFrom(str, Enum):
-    """Frame in which a tool centre point is given."""
-
-    tip = "tip"
-    measured = "measured"
-
-
-class Free(str, Enum):
-    """Parts of the set-up that may have moved."""
-
-    both = "both"
-    base = "base"
-    marker = "marker"
-
-
-class MarkerFreedom(str, Enum):
-    """How far the markers may have moved on the tool."""
-
-    evidence = "evidence"
-    same = "same"
-    moved = "moved"
-    other = "other"
-
-
-class Drift(str, Enum):
-    """Changes of the robot itself that are considered."""
-
-    tested = "tested"
-    none = "none"
-
+Length = Literal["m", "mm"]
+Angle = Literal["rad", "deg"]
+DH = Literal["standard", "craig"]
+Frame = Literal["base", "measuring"]
+ToolFrom = Literal["tip", "measured"]
+Free = Literal["both", "base", "marker"]
+"""Parts of the set-up that may have moved."""
+MarkerFreedom = Literal["evidence", "same", "moved", "other"]
+Drift = Literal["tested", "none"]
 
 # --- files, seeds, masses -----------------------------------------------------------------------------------------
 
@@ -286,10 +236,7 @@ class EvaluateOptions:
     output: Path | None = option(
         "With --register: write the registered model to this file.",
         "MODEL",
-        names=(
-            "-o",
-            "--output",
-        ),
+        names=("-o", "--output"),
     )
     fail_above: str | None = option(
         "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
@@ -358,8 +305,8 @@ class Correction:
         "the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
-    tool_from: ToolFromOption = ToolFrom.tip
-    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default=Frame.base)
+    tool_from: ToolFromOption = "tip"
+    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default="base")
     limit: float | None = option(
         "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
     )
@@ -376,7 +323,7 @@ class Export:
     urdf: Path | None = option("Write the robot's own URDF with corrected joint origins.", "URDF")
     mjcf: Path | None = option("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = option("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
-    dh_convention: DH = option("Convention of --dh; craig is also called modified.", default=DH.standard)
+    dh_convention: DH = option("Convention of --dh; craig is also called modified.", default="standard")
     ur_kinematics: Path | None = option("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
     ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
     joint_offsets: Path | None = option("Write the best joint offsets, all other geometry nominal.", "CSV")
@@ -397,7 +344,7 @@ class Export:
         "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
-    tool_from: ToolFromOption = ToolFrom.tip
+    tool_from: ToolFromOption = "tip"
     frame: Frame | None = option(
         "Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the "
         "measuring device."
@@ -405,8 +352,8 @@ class Export:
     tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
     robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
     payload_mass: Mass = None
-    length: Length = option("Unit of lengths in the CSV files written.", default=Length.m)
-    angle: Angle = option("Unit of angles in the CSV files written.", default=Angle.rad)
+    length: Length = option("Unit of lengths in the CSV files written.", default="m")
+    angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
 
     @property
     def outputs(self) -> dict[str, Path | None]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 import typer
@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -41,9 +41,8 @@ UNKNOWN_ZERO_M = 1.0
 
 def table_format(units: Units) -> TableFormat:
     """The format of a table of points; the separator may be a tab written as \\t or tab."""
-    slides = None if units.joint_length is None else units.joint_length.value
     mark = "\t" if units.sep in ("\\t", "tab") else units.sep
-    return TableFormat(units.length.value, units.angle.value, mark, units.decimal, joint_length=slides)
+    return TableFormat(units.length, units.angle, mark, units.decimal, joint_length=units.joint_length)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
@@ -60,7 +59,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         table,
         rotation=_names_of_each(rows.rotation),
         convention=rows.convention,
-        rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
+        rotation_angle=rows.rotation_angle,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
         remounted=rows.remounted,
@@ -195,9 +194,12 @@ def _completed(group: Any, words: Sequence[str]) -> Any:
     for option, own in _read_options(words, type(group)).items():
         name, kind = options[option]
         texts = own[1::2]
-        of = {Length, Angle, float} & {*get_args(kind), kind}
-        values = [one(text) for text in texts for one in of or [str]]
-        several = any(get_args(one) for one in get_args(kind))
+        allowed = next((get_args(one) for one in (kind, *get_args(kind)) if get_origin(one) is Literal), texts)
+        wrong = [text for text in texts if text not in allowed]
+        if wrong:
+            raise ValueError(f"'{wrong[0]}' for {option}")
+        values = [float(text) for text in texts] if float in get_args(kind) else texts
+        several = any(get_origin(one) is list for one in get_args(kind))
         changes[name] = True if kind is bool else values if several else values[-1]
     return replace(group, **changes)
 
@@ -313,8 +315,7 @@ class ProgramTable:
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, a rotation vector without one."""
-        unit = None if self.rotation_angle is None else self.rotation_angle.value
-        plain = replace(self.table, convention=self.convention, rotation_angle=unit)
+        plain = replace(self.table, convention=self.convention, rotation_angle=self.rotation_angle)
         return plain.for_writing(rotation_std=False)
 
 

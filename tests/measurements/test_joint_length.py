@@ -14,7 +14,7 @@ from table_bank import HEADER, Reader
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Angle, Length, Units
+from diffeo_calib.cli.options import Units
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
@@ -50,7 +50,7 @@ def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     robot, q = sliding_robot(), sliding_measurements(sliding_robot(), 3).q
     path, table = (
         tmp_path / "program.csv",
-        table_format(Units(length=Length.mm, angle=Angle.deg, joint_length=Length.m)),
+        table_format(Units(length="mm", angle="deg", joint_length="m")),
     )
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.options import Correction, Frame, StoredUnits
+from diffeo_calib.cli.options import Correction, StoredUnits
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
@@ -93,17 +93,17 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
-    how = {"frame": options.frame.value, "bound": bound, "path": rate is not None, "rate": rate}
+    how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
         progress("commands", 0, 1)
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     allowed = found.q.isfinite().all(1)
-    known = [tool.known(kinematics, found.q[allowed], options.frame.value) for tool in tools if bool(allowed.any())]
+    known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
     sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
     record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)
-    where = "robot's base" if options.frame.value == "base" else "measuring frame"
+    where = "robot's base" if options.frame == "base" else "measuring frame"
     for tool, each in zip(tools, known, strict=False):
         say(_how_well_known(tool, *each, where))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
@@ -119,7 +119,7 @@ def _check(options: Correction) -> None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:
         check_number(options.rate, "--rate", above=0.0)
-    if options.frame is Frame.measuring and not options.position:
+    if options.frame == "measuring" and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
@@ -137,14 +137,14 @@ def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -
     numbers = named.tool or [None] * max(len(tips), 1)
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
-        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from.value, table))]
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from, table))]
     again = [tip for k, tip in enumerate(tips) if tip in tips[:k]]
     if again:
         raise InputError.of(f"--tip {again[0]} is named twice", fix="name every tip once")
     found = []
     for tip, text in zip(tips, numbers, strict=True):
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from.value, table)
+        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
     return found
 

@@ -64,8 +64,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         say(line)
     data = source.read(model.robot)
     if options.register:
-        free = "both" if options.free is None else options.free.value
-        return _registered(model, path.name, data, free, options.output)
+        return _registered(model, path.name, data, options.free or "both", options.output)
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)

@@ -112,7 +112,7 @@ class _Export:
 
     def __init__(self, model: CalibratedKinematics, given: Export) -> None:
         self.model, self.given = model, given
-        self.length, self.angle = given.length.value, given.angle.value
+        self.length, self.angle = given.length, given.angle
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
         self.lines: list[str] = []
@@ -144,7 +144,7 @@ class _Export:
 
     def _text(self, option: str, geometry: Geometry, urdf: bytes | None) -> str:
         if option == "--dh":
-            table = dh_table(geometry, self.given.dh_convention.value, self.given.tip or self.model.tool_tip)
+            table = dh_table(geometry, self.given.dh_convention, self.given.tip or self.model.tool_tip)
             self.lines += _dh_lines(table, self.given)
             return dh_text(table, self.length, self.angle)
         content = urdf or b""
@@ -194,9 +194,9 @@ def run(path: Path, given: Export) -> None:
     """
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
     model = load_laden(path, given.payload_mass)
-    units = TableFormat(given.length.value, given.angle.value)
-    own = tool_in_tip(model, given.tool, given.tool_from.value, units)
-    tool = Tool(None if given.tool is None else own, None if given.frame is None else given.frame.value)
+    units = TableFormat(given.length, given.angle)
+    own = tool_in_tip(model, given.tool, given.tool_from, units)
+    tool = Tool(None if given.tool is None else own, given.frame)
     export = _Export(model, given)
     tables = "--correction-tables" in wanted
     if rigid := [option for option in wanted if option in RIGID]:
@@ -272,9 +272,9 @@ def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
 
 def _place(transform: Tensor, given: Export) -> str:
     xyz, rpy = origin_numbers(transform)
-    place = " ".join(f"{value:.6g}" for value in in_unit(xyz, given.length.value))
-    turn = " ".join(f"{value:.6g}" for value in in_unit(rpy, given.angle.value))
-    return f"{place} {given.length.value}, {turn} {given.angle.value}"
+    place = " ".join(f"{value:.6g}" for value in in_unit(xyz, given.length))
+    turn = " ".join(f"{value:.6g}" for value in in_unit(rpy, given.angle))
+    return f"{place} {given.length}, {turn} {given.angle}"
 
 
 def _table_lines(tables: list[CorrectionTable]) -> Iterator[str]:

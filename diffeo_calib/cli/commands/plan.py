@@ -85,7 +85,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
             target=configurations(given.target_poses),
             marker=None if framed else markers,
             measured=configurations(given.measured),
-            free=None if given.free is None else given.free.value,
+            free=given.free,
             sensor=sensors,
         )
     found.write(output, table, names)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -23,17 +23,7 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-@dataclass(frozen=True)
-class Options:
-    """Assumptions about the set-up, and the note that is kept with the model."""
-
-    marker: str
-    drift: str
-    seed: int
-    note: str
-
-
-def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
+def run(old: Path, table: TableOptions, output: Path, **how: Any) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model = load_kinematics(old)
     source = table_of(model, table)
@@ -44,8 +34,7 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)
         warn_outside_range(model, data.q)
-        named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
-        result = recalibrate(model, data, progress=progress, **named)
+        result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
         changes=changes_entry(result.changes),
