@@ -331,8 +331,7 @@ def read_readings(
         raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
     given = [std] if isinstance(std, str) else std
     known = () if given is None else column_names("std", given, "names of columns", several)
-    lens = {} if intrinsics is None else {"intrinsics": intrinsics}
-    of_kind = ReadingColumns(kind, names, session, offset_std, std=known, on=on, **lens)
+    of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or (1.0, 1.0, 0.0, 0.0), known, on)
     table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
     return _read(path, TableColumns(robot, readings=(of_kind,), kinds=kinds), table, duplicates, joints)
 
