@@ -12,7 +12,6 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
-from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
@@ -62,7 +61,7 @@ def campaign_command(
     robot: options.Robot,
     units: options.Units,
     rows: options.Rows,
-    given: LiveOptions,
+    given: options.LiveOptions,
 ) -> None:
     """Judge rows while they are measured.
 
@@ -141,9 +140,8 @@ def evaluate_command(
         raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
     check_outputs({"-o": given.output, "--residuals": given.residuals}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
-    evaluate.run(model, TableOptions(csv, rows, units), given)
+    evaluate.run(model, options.TableOptions(csv, rows, units), given)
 
 
 @command("init")
@@ -211,10 +209,9 @@ def predict_command(
     """
     check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli.commands import predict  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     rows = options.Rows(convention=convention, rotation_angle=rotation_angle, payload=payload)
-    predict.run(model, TableOptions(csv, rows, units), output)
+    predict.run(model, options.TableOptions(csv, rows, units), output)
 
 
 @command("correct")
@@ -362,9 +359,10 @@ def recalibrate_command(
     """
     check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
-    recalibrate.run(old, TableOptions(csv, rows, units), output, marker=marker, drift=drift, seed=seed, note=note)
+    recalibrate.run(
+        old, options.TableOptions(csv, rows, units), output, marker=marker, drift=drift, seed=seed, note=note
+    )
 
 
 @command("compare")
@@ -398,7 +396,6 @@ def compare_command(
     """
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     if compare.is_model(other):
         if rows.named or units.length or units.angle:
@@ -408,7 +405,7 @@ def compare_command(
         return
     if figure is not None:
         raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
-    compare.run(old, TableOptions(other, rows, units), marker, level, seed)
+    compare.run(old, options.TableOptions(other, rows, units), marker, level, seed)
 
 
 @command("report")
@@ -426,12 +423,11 @@ def report_command(
     """
     check_outputs({"-o": output}, {"MODEL": model} | ({} if page.data is None else {"--data": page.data}))
     from diffeo_calib.cli.commands import report  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     if page.data is None and (rows.named or units.length or units.angle or page.against):
         what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
         raise InputError.of(what, fix="name the table with --data, or leave them out")
-    report.run(model, output, None if page.data is None else TableOptions(page.data, rows, units), page)
+    report.run(model, output, None if page.data is None else options.TableOptions(page.data, rows, units), page)
 
 
 @command("demo")

@@ -10,15 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
-from diffeo_calib.cli.tables import (
-    MeasuredTable,
-    TableOptions,
-    as_at_the_fit,
-    measured_table,
-    rows_in_table,
-    tool_frame,
-)
+from diffeo_calib.cli.options import Robot, Rows, StoredUnits, TableOptions, Units
+from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -64,8 +57,7 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
 
 def planned(model: CalibratedKinematics, mass: float | None) -> tuple[CalibratedKinematics, Tensor]:
     """A model to plan with, of a robot that carries a mass, by default the median of the fit; its markers (P, 3), m."""
-    for line in provenance_lines(model):
-        say(line)
+    say(*provenance_lines(model))
     if mass is not None:
         model = model.with_payload(mass)
     elif model.payload is not None:

@@ -193,6 +193,15 @@ class Rows:
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+@dataclass(frozen=True)
+class TableOptions:
+    """A table as a command with a model names it: the file, what its rows hold, how it is written."""
+
+    csv: Path
+    rows: Rows
+    units: StoredUnits
+
+
 # --- the commands that measure ------------------------------------------------------------------------------------
 
 
@@ -279,6 +288,39 @@ class BoardImages:
     overview: Path | None = option("Write a page with all images and their corners.", "HTML")
     sep: str = option("Separator of both tables.", default=",")
     decimal: str = option("Decimal mark of both tables.", default=".")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How to follow a campaign."""
+
+    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
+    stdin: bool = option(
+        "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
+    )
+    listen: str | None = option(
+        "Take the same lines from a socket of this machine, 0 for any free port, and answer each: "
+        "campaign/feeds.py describes them. Addresses of other machines need --token.",
+        "[HOST:]PORT",
+    )
+    token: str = option(
+        "What a program must send first to --listen; other users of this machine see what is typed, not the variable.",
+        "TEXT",
+        default="",
+        envvar="DIFFEO_CALIB_TOKEN",
+    )
+    json_lines: bool = option(
+        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
+    )
+    bag: Path | None = option("Append the stops of a ROS 2 bag to CSV, at their times; see `record`.", "BAG")
+    seen: str | None = option("Topic of --bag: stamped points, poses or transforms that a device measured.", "TOPIC")
+    joint_states: str = option("Topic of --bag: joint states.", "TOPIC", default="/joint_states")
+    speed: float = option("How many times faster --bag is played than it was recorded.", min=1e-3, default=1.0)
+    once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
+    candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
+    page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
+    next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
+    accepted: Path | None = option("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
 
 
 # --- the commands that apply models -------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Correction, Format, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -32,11 +32,10 @@ from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
-UNKNOWN_ZERO_M = 1.0
-"""Standard deviation of the unknown zero of displacements: wide."""
 
 
 def table_format(units: Units) -> TableFormat:
@@ -69,15 +68,6 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         time=rows.time,
         temperature=rows.temperature,
     )
-
-
-@dataclass(frozen=True)
-class TableOptions:
-    """A table as a command with a model names it: the file, what its rows hold, how it is written."""
-
-    csv: Path
-    rows: Rows
-    units: StoredUnits
 
 
 def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
@@ -270,25 +260,14 @@ class ProgramTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        position: X,Y,Z of the targets of every tool; none if the commands' nominal poses are the targets.
-        rotation: columns of the targets' orientations.
         table: units, separator and decimal mark.
-        convention: how rotations are written. rotation_angle: unit of their angles.
+        given: columns of the targets of every tool; none if the commands' nominal poses are the targets.
     """
 
     csv: Path
     joints: str | None
-    position: list[str]
-    rotation: list[str]
     table: TableFormat
-    convention: str | None
-    rotation_angle: Angle | None
-
-    @classmethod
-    def of(cls, csv: Path, units: Units, given: Correction) -> ProgramTable:
-        """The program that the options of `correct` describe."""
-        targets = given.position or [], given.rotation or []
-        return cls(csv, units.joints, *targets, table_format(units), given.convention, given.rotation_angle)
+    given: Correction
 
     def commands(self, robot: Tree) -> Tensor:
         """(N, n) joint values, rad or m."""
@@ -300,22 +279,23 @@ class ProgramTable:
         Raises:
             InputError: a rotation without a position, or not one position for every tool.
         """
-        if not self.position:
-            if self.rotation:
+        position, rotation = self.given.position, self.given.rotation
+        if not position:
+            if rotation:
                 raise InputError.of("--rotation without --position", fix="name the columns of the position too")
             return None
-        if len(self.position) != tools:
+        if len(position) != tools:
             fix = "name the columns of the targets once for every --tip"
-            raise InputError.of("--position", expected=f"{tools} of them", got=len(self.position), fix=fix)
-        turned = Rows(rotation=self.rotation or None, convention=self.convention, rotation_angle=self.rotation_angle)
-        table = with_rows(self.table, turned) if self.rotation else self.table
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
+            raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
+        how = {"convention": self.given.convention, "rotation_angle": self.given.rotation_angle}
+        table = with_rows(self.table, Rows(rotation=rotation, **how)) if rotation else self.table
+        names, triples = joint_columns(self.joints, robot), _position_triples(position)
         data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
         return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, a rotation vector without one."""
-        plain = replace(self.table, convention=self.convention, rotation_angle=self.rotation_angle)
+        plain = replace(self.table, convention=self.given.convention, rotation_angle=self.given.rotation_angle)
         return plain.for_writing(rotation_std=False)
 
 

@@ -22,25 +22,10 @@ class TableFormat:
     """How a table of measurements or predictions is written.
 
     Args:
-        length: unit of the positions, ``"m"`` or ``"mm"``.
-        angle: unit of the revolute joints, ``"rad"`` or ``"deg"``.
-        sep: one character between cells.
-        decimal: ``"."`` or ``","``.
-        rotation: names of the columns of the tool's rotation, or one such list for each of several measured frames;
-            None for a table of points.
-        convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
-            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
-        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
-        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
-        std: names of the columns with standard deviations of the positions, in the unit of length: one for all, one
-            per marker or three per marker.
-        rotation_std: names of the columns with standard deviations of the rotation about the axes of the measuring
-            frame: one for all, or a list of one or three for each frame.
-        joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
-        payload: name of the column with the known mass that the robot carries, in any unit.
-        time, temperature: names of columns with which something may drift, in any unit.
-        camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
         remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
+
+    The others are as in :func:`read_measurements`: units, marks, and names of columns, those of rotations None for a
+    table of points.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.

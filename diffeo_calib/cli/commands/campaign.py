@@ -18,9 +18,8 @@ from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.live import Live, expected
-from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.models import load_robot
-from diffeo_calib.cli.options import Robot
+from diffeo_calib.cli.options import LiveOptions, Robot
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import InputError

@@ -15,7 +15,7 @@ from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.options import Correction, StoredUnits
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns
+from diffeo_calib.cli.tables import ProgramTable, joint_columns, table_format
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -78,7 +78,8 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     """
     _check(options)
     kinematics = load_laden(model, options.payload_mass)
-    source = ProgramTable.of(program, as_fitted(kinematics, None, units)[1], options)
+    stated = as_fitted(kinematics, None, units)[1]
+    source = ProgramTable(program, stated.joints, table_format(stated), options)
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
@@ -232,8 +233,7 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
             _add_sizes(table, plain(f"{name}, {'deg' if turns else 'mm'}"), sizes)
         out.print(table)
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
-    for line in _missed_lines(found, tools, lines):
-        say(line)
+    say(*_missed_lines(found, tools, lines))
     few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
     if few_joints and 2 * int(found.reached.sum()) < len(found):
         fix, of_tools = (

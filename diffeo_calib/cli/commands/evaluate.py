@@ -19,7 +19,7 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.options import EvaluateOptions
+from diffeo_calib.cli.options import EvaluateOptions, TableOptions
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -28,7 +28,7 @@ from diffeo_calib.cli.printed import (
     socket_lines,
 )
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import MeasuredTable, TableOptions
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.interop.model_file import save
@@ -60,8 +60,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     source = table_of(model, table)
     limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
-    for line in provenance_lines(model):
-        say(line)
+    say(*provenance_lines(model))
     data = source.read(model.robot)
     if options.register:
         return _registered(model, path.name, data, options.free or "both", options.output)
@@ -75,8 +74,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
     _say_places(places)
-    for line in _expectations(model, data, found):
-        say(line)
+    say(*_expectations(model, data, found))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if doubt is not None:
@@ -141,8 +139,7 @@ def _say_places(places: Places) -> None:
         record.add(session_transforms=places.frames.entry())
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
-    for line in places.found:
-        say(plain(line))
+    say(*map(plain, places.found))
 
 
 def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
@@ -157,8 +154,7 @@ def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evalua
     judgement = judge(model, places, data, found)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
-    for line in outlier_lines(judgement.outliers, judgement.rows, which):
-        say(line)
+    say(*outlier_lines(judgement.outliers, judgement.rows, which))
     for text in judgement.causes:
         warn_user(text)
 
@@ -166,8 +162,7 @@ def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evalua
 def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     warn_outside_range(model, data.q)
-    for line in another_date_lines(model):
-        say(line)
+    say(*another_date_lines(model))
     found = model.registered(data, free=free, learn=False)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
@@ -183,7 +178,6 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
             table.add(before[kind], f"{after.count} with the places of the fit")
         table.add(after, f"{after.count} with places found anew")
         out.print(table)
-    for line in (*registration_lines(found), *placement_sentences(found)):
-        say(plain(line))
+    say(*map(plain, (*registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")

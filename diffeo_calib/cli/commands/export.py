@@ -153,8 +153,7 @@ def run(path: Path, given: Export) -> None:
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
-    for line in (*export.lines, *_limits(model, rigid)):
-        say(line)
+    say(*export.lines, *_limits(model, rigid))
     for option in export.files:
         say(f"{option[2:]}: {wanted[option]}")
     for line in _write_programs(model, given, tool, source):

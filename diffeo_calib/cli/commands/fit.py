@@ -61,15 +61,12 @@ def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) ->
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**hand_eye_entry(hand_eye))
     _record(result, in_train, held_out, {"model": output, "figure": given.figure, "report": given.report})
-    for line in _verdict(result, held_out or {}):
-        say(line)
+    say(*_verdict(result, held_out or {}))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
     wrong = [] if held_out is None else _contradicted(result.model, held_out)
-    for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
-        say(line)
-    for line in _lines_about_places(result, data, held_out, hand_eye):
-        say(line)
+    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+    say(*_lines_about_places(result, data, held_out, hand_eye))
     for one in (held_out or {}).values():
         if one.one.what == ERRORS:
             _show_verdict(one.stages[GEOMETRIC], one.stages[CALIBRATED], wrong=bool(wrong))
@@ -226,12 +223,10 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         out.print(parts_table(result.parts))
     for wave in result.gear_lines:
         say(wave.sentence)
-    for line in outlier_lines(result.outliers, rows):
-        say(line)
+    say(*outlier_lines(result.outliers, rows))
     say(result.status)
     if detailed:
-        for line in _solver_lines(result):
-            say(line)
+        say(*_solver_lines(result))
 
 
 def _solver_lines(result: CalibrationResult) -> Iterator[str]:

@@ -94,14 +94,12 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
     if isinstance(source, CalibratedKinematics):
         say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
-        for line in expectation_lines(source, None):
-            say(line)
+        say(*expectation_lines(source, None))
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:
         say("its column `device`: what measures the pose")
-        for line in [line for one in sensors for line in one.sentences()]:
-            say(line)
+        say(*(line for one in sensors for line in one.sentences()))
 
 
 def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:

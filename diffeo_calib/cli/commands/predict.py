@@ -12,9 +12,9 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import Progress, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Rows, TableOptions
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, with_rows
+from diffeo_calib.cli.tables import joint_columns, table_format, with_rows
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -61,8 +61,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
         InputError: options of a rotation for a model that was calibrated with points.
     """
     kinematics = load_kinematics(model)
-    for line in provenance_lines(kinematics):
-        say(line)
+    say(*provenance_lines(kinematics))
     table, joints = _written_as_read(kinematics, given)
     robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
@@ -87,8 +86,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if kinematics.own_frame:
         say(OWN_FRAME)
-    for line in readings.sentences():
-        say(line)
+    say(*readings.sentences())
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
