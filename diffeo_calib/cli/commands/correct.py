@@ -31,6 +31,11 @@ from diffeo_calib.robots.tree import Tree
 AXES_OF_A_POSE = 6
 ROWS_AT_ONCE = 100
 """Rows whose deviations are predicted together."""
+REASONS = {
+    "unreachable": "unreachable with corrections within --limit",
+    "singular": "singular: near a singularity it needs a correction larger than --limit",
+}
+"""Statuses in words: the largest correction is part of them."""
 MOST_MISSED = 10
 """Most lines about rows that are not reached."""
 
@@ -102,7 +107,8 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     allowed = found.q.isfinite().all(1)
     known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
     sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
-    record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
+    misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
+    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)
     where = "robot's base" if options.frame == "base" else "measuring frame"
     for tool, each in zip(tools, known, strict=False):
@@ -207,13 +213,9 @@ def _added(
     return added
 
 
-def _misses(found: Compensation, tools: list[ToolOnTip]) -> dict[str, dict[str, Tensor | None]]:
-    """By tip, how far its tool is from each row's target, NaN where it has none, for programs."""
-    angles = None if found.angle_miss is None else found.angle_miss.rad2deg()
-    return {
-        tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": None if angles is None else tool.own(angles)}
-        for tool in tools
-    }
+def _degrees(found: Compensation, tool: ToolOnTip) -> Tensor | None:
+    """Angles (N,) of the tool from its targets, NaN where it has none; None for targets without orientation."""
+    return None if found.angle_miss is None else tool.own(found.angle_miss).rad2deg()
 
 
 def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
@@ -236,10 +238,8 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
     say(*_missed_lines(found, tools, lines))
     few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
     if few_joints and 2 * int(found.reached.sum()) < len(found):
-        fix, of_tools = (
-            "name target positions instead (--position)",
-            "" if len(tools) == 1 else f" of {len(tools)} tools",
-        )
+        fix = "name target positions instead (--position)"
+        of_tools = "" if len(tools) == 1 else f" of {len(tools)} tools"
         warn_user(sentence(f"a robot with {robot.n} joints cannot hold every orientation{of_tools}", fix=fix))
     elif 2 * found.counts.get("unreachable", 0) > len(found):
         what = "most targets are farther from their commands than the largest correction allows"
@@ -284,7 +284,8 @@ def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int])
             yield f"  line {lines[row]}: {found.status[row]}, no command is allowed: it starts beyond a joint's limit"
             continue
         misses = ", ".join(filter(None, (_miss(found, tool, row) for tool in tools)))
-        yield f"  line {lines[row]}: {_reason(found, row)}, {misses}"
+        status = str(found.status[row])
+        yield f"  line {lines[row]}: {REASONS.get(status, status)}, {misses}"
     if len(missed) > MOST_MISSED:
         yield f"  and {len(missed) - MOST_MISSED} more; see the column `status`"
 
@@ -294,16 +295,7 @@ def _miss(found: Compensation, tool: ToolOnTip, row: int) -> str:
     distance = float(tool.own(found.miss)[row])
     if isnan(distance):
         return ""
-    angle = "" if found.angle_miss is None else f" and {float(tool.own(found.angle_miss)[row].rad2deg()):.4f} deg"
+    degrees_off = _degrees(found, tool)
+    angle = "" if degrees_off is None else f" and {float(degrees_off[row]):.4f} deg"
     who = "misses" if tool.place is None else f"{tool.tip} misses"
     return f"{who} by {1e3 * distance:.4f} mm{angle}"
-
-
-def _reason(found: Compensation, row: int) -> str:
-    """A status, and what "unreachable" means: the largest correction is part of it."""
-    status = found.status[row]
-    words = {
-        "unreachable": "unreachable with corrections within --limit",
-        "singular": "singular: near a singularity it needs a correction larger than --limit",
-    }
-    return words.get(str(status), str(status))
