@@ -180,11 +180,7 @@ class Live:
         self.journal.add(self._revised())
 
     def _append(self, row: Entry) -> int:
-        """Append a row to the table and judge it; the number of its line.
-
-        Raises:
-            InputError: no row of this table, or it cannot be written.
-        """
+        """Append a row to the table and judge it; the number of its line."""
         self.judge(self.new_lines())
         header, line = self.table.written(row)
         self._read([line], header, len(self.lines))

@@ -23,11 +23,7 @@ from diffeo_calib.sensors.known_drift import KnownDrift
 
 
 def load_kinematics(path: Path) -> CalibratedKinematics:
-    """Load the model of a robot.
-
-    Raises:
-        InputError: the file cannot be read, or holds the model of another map.
-    """
+    """Load the model of a robot."""
     model = load(path)
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of(f"{path} is not a robot's model", fix="pass a file written by `diffeo-calib fit`")
@@ -44,9 +40,6 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
 
     Args:
         path: the file. mass: in the unit of the model's measurements; None for a model without payloads.
-
-    Raises:
-        InputError: a mass for a model without payloads, or none for another.
     """
     model = load_kinematics(path)
     if model.payload is not None and mass is None:
@@ -118,11 +111,7 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:
-    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text.
-
-    Raises:
-        InputError: no numbers of a tool, or the measured frame of a model of points.
-    """
+    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text."""
     if text is None:
         if tool_from != "tip":
             raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")

@@ -76,14 +76,6 @@ Convention = Annotated[
 RotationAngle = Annotated[
     Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles and rotation vectors.")
 ]
-Tip = Annotated[
-    list[str],
-    typer.Option(
-        "--tip",
-        metavar="LINK",
-        help="Last link of the chain, to which the markers are fixed; for several tips once per --position.",
-    ),
-]
 PayloadColumn = Annotated[
     str | None,
     typer.Option("--payload", metavar="COLUMN", help="Column with the known mass that the robot carried, in any unit."),
@@ -211,7 +203,11 @@ class Robot:
 
     robot: Path = option("The robot's description.", "URDF", default=...)
     base: str = option("First link of the chain.", "LINK", default=...)
-    tip: Tip
+    tip: list[str] = option(
+        "Last link of the chain, to which the markers are fixed; for several tips once per --position.",
+        "LINK",
+        default=...,
+    )
     load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
 
 

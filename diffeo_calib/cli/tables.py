@@ -45,11 +45,7 @@ def table_format(units: Units) -> TableFormat:
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with the columns of rotations, deviations, payloads and covariates; lever in the unit of length.
-
-    Raises:
-        InputError: a lever or a camera on the tool without a rotation.
-    """
+    """The same format with columns of rotations, deviations, payloads and covariates; lever in the unit of length."""
     if rows.lever is not None and rows.rotation is None:
         raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
     if rows.camera_on_tool and rows.rotation is None and not rows.images:
@@ -71,11 +67,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
 
 
 def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
-    """The table that options describe; exact repeats are kept by default.
-
-    Raises:
-        InputError: options that do not go together, or are not written as they should be.
-    """
+    """The table that options describe; exact repeats are kept by default."""
     check_place(rows)
     table = with_rows(table_format(units), rows)
     readings = readings_columns(rows.reading or (), rows)
@@ -109,9 +101,6 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     Args:
         command: that made the model, or the options of its table alone; empty where neither is known.
         rows: None for a table of joint values alone.
-
-    Raises:
-        InputError: units that are neither typed nor known, or options in the model that are none.
     """
     own = rows or Rows()
     groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
@@ -229,9 +218,6 @@ class MeasuredTable:
 
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
-
-        Raises:
-            InputError: not one tip for every marker.
         """
         triples = _position_triples(self.position) or None
         several = len(tips) > 1 and self.sockets is None and not self.readings
@@ -274,11 +260,7 @@ class ProgramTable:
         return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
 
     def targets(self, robot: Tree, tools: int) -> Tensor | None:
-        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none.
-
-        Raises:
-            InputError: a rotation without a position, or not one position for every tool.
-        """
+        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
         position, rotation = self.given.position, self.given.rotation
         if not position:
             if rotation:
@@ -300,11 +282,7 @@ class ProgramTable:
 
 
 def tool_frame(text: str, table: TableFormat) -> Tensor:
-    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m.
-
-    Raises:
-        InputError: another number of numbers.
-    """
+    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m."""
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
     words = text.split(",")
@@ -321,11 +299,7 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
 
 
 def joint_columns(joints: str | None, robot: Tree) -> list[str]:
-    """Names of the joint columns: those given, or the robot's.
-
-    Raises:
-        InputError: another number of names than joints, or the robot's own names in another order.
-    """
+    """Names of the joint columns: those given, or the robot's."""
     if not joints:
         return list(robot.joint_names)
     names = _split_names(joints)
@@ -361,11 +335,7 @@ def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | Non
 def socket_columns(
     socket: str | None, distance: list[str] | None, std: float | None, table: TableFormat
 ) -> SocketColumns | None:
-    """The options of sockets in SI units; None without sockets.
-
-    Raises:
-        InputError: a distance that is not written as A,B=LENGTH.
-    """
+    """The options of sockets in SI units; None without sockets."""
     if socket is None:
         return None
     known = dict(_distance(text, table) for text in distance or ())
@@ -397,9 +367,6 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
     """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
 
     Of several cameras each has a file, whose name without .yaml is that of the camera in the table.
-
-    Raises:
-        InputError: neither a size nor the file of a camera; several texts one of which is no file.
     """
     names = [text.removeprefix(CORNERS).strip() for text in texts]
     if len(names) == 1:

@@ -89,11 +89,7 @@ def load(
 
 
 def _checked(kernels: object) -> KernelClasses:
-    """Classes of kernels and profiles by their names; classes of profiles are called without arguments.
-
-    Raises:
-        InputError: something else, or a profile with wrong derivatives.
-    """
+    """Classes of kernels and profiles by their names; classes of profiles are called without arguments."""
     if kernels is None:
         return {}
     if not isinstance(kernels, Mapping) or not all(map(_is_kernel, kernels.values())):

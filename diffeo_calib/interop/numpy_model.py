@@ -39,9 +39,6 @@ class NumpyKinematics:
         """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.
 
         Data frames are taken by the names of the joints, here and below.
-
-        Raises:
-            InputError: wrong shape, or values that are not finite.
         """
         return self.program.points(self._joints(q))
 

@@ -252,11 +252,7 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
 
 
 def _exact(model: CalibratedKinematics | FittedMap) -> GeodesicDeformation:
-    """The model's deformation.
-
-    Raises:
-        InputError: none with constant stages.
-    """
+    """The model's deformation."""
     fitted = model.map if isinstance(model, CalibratedKinematics) else model
     deformation = fitted.deformation
     if not isinstance(deformation, GeodesicDeformation):

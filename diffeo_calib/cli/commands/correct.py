@@ -76,11 +76,7 @@ class ToolOnTip:
 
 
 def run(model: Path, program: Path, units: StoredUnits, options: Correction, output: Path) -> None:
-    """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit.
-
-    Raises:
-        InputError: options that contradict each other, columns that are missing or taken.
-    """
+    """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     kinematics = load_laden(model, options.payload_mass)
     stated = as_fitted(kinematics, None, units)[1]
@@ -132,11 +128,7 @@ def _check(options: Correction) -> None:
 
 
 def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -> list[ToolOnTip]:
-    """The tools that have targets.
-
-    Raises:
-        InputError: tips that are unknown or repeated, or not one tool for every tip.
-    """
+    """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):
         expected, fix = f"{max(len(tips), 1)} of them", "give one tool for every --tip"

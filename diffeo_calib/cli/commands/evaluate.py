@@ -20,13 +20,7 @@ from diffeo_calib.cli.models import (
     table_of,
 )
 from diffeo_calib.cli.options import EvaluateOptions, TableOptions
-from diffeo_calib.cli.printed import (
-    ErrorTable,
-    expectation_lines,
-    outlier_lines,
-    registration_lines,
-    socket_lines,
-)
+from diffeo_calib.cli.printed import ErrorTable, expectation_lines, outlier_lines, registration_lines, socket_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
@@ -73,8 +67,13 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
-    _say_places(places)
-    say(*_expectations(model, data, found))
+    if isinstance(places.frames, MeasuringFrames):
+        record.add(session_transforms=places.frames.entry())
+    if places.numbers:
+        record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
+    say(*map(plain, places.found))
+    say(*(line for errors in found.values() for line in socket_lines(errors, "all rows")))
+    say(*expectation_lines(model, data))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if doubt is not None:
@@ -131,22 +130,6 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
         values = [entry[name] * (per_mm if metres else 1.0) for name in COLUMNS[5:9]]
         cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
-
-
-def _say_places(places: Places) -> None:
-    """Print and record what was found from the rows."""
-    if isinstance(places.frames, MeasuringFrames):
-        record.add(session_transforms=places.frames.entry())
-    if places.numbers:
-        record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
-    say(*map(plain, places.found))
-
-
-def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
-    """Known distances, and the absolute error to expect."""
-    for errors in found.values():
-        yield from socket_lines(errors, "all rows")
-    yield from expectation_lines(model, data)
 
 
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:

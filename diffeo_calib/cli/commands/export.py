@@ -128,11 +128,7 @@ class _Export:
 
 
 def run(path: Path, given: Export) -> None:
-    """Write the files, then say what each leaves of the model.
-
-    Raises:
-        InputError: the model or the robot's description cannot be used, or a file cannot be written.
-    """
+    """Write the files, then say what each leaves of the model."""
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
     model = load_laden(path, given.payload_mass)
     units = TableFormat(given.length, given.angle)

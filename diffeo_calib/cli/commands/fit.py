@@ -56,7 +56,9 @@ def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) ->
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
-    hand_eye = hand_eye_of(result)
+    own = result.placed.coordinates
+    on_tool = None if own is None else own.table.sees_board_from_tool  # of a camera that measured the rows
+    hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, output)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**hand_eye_entry(hand_eye))
@@ -97,13 +99,6 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
             check_errors(result.model, one.one, in_train[kind].stages[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
-
-
-def hand_eye_of(result: CalibrationResult) -> dict[str, HandEye]:
-    """Cameras and board by the names of the cameras; none if no camera is known to have measured the rows."""
-    own = result.placed.coordinates
-    on_tool = None if own is None else own.table.sees_board_from_tool
-    return {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
 
 
 def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
@@ -226,15 +221,10 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     say(*outlier_lines(result.outliers, rows))
     say(result.status)
     if detailed:
-        say(*_solver_lines(result))
-
-
-def _solver_lines(result: CalibrationResult) -> Iterator[str]:
-    """How many parameters the fit has, and how well it solves its equations."""
-    left_out, fitted = result.leave_one_out, result.fit
-    if left_out.effective is not None:
-        yield f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates"
-    yield (
-        f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
-        f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
-    )
+        left_out, fitted = result.leave_one_out, result.fit
+        if left_out.effective is not None:
+            say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
+        say(
+            f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
+            f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
+        )

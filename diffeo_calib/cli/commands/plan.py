@@ -236,11 +236,7 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
 
 
 def _numbers(option: str, text: str, counts: tuple[int, ...]) -> list[float]:
-    """Numbers separated by commas.
-
-    Raises:
-        InputError: another number of numbers.
-    """
+    """Numbers separated by commas."""
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError:

@@ -56,9 +56,6 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     A payload that is a number is the mass of all rows.
-
-    Raises:
-        InputError: options of a rotation for a model that was calibrated with points.
     """
     kinematics = load_kinematics(model)
     say(*provenance_lines(kinematics))
