@@ -170,10 +170,10 @@ def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str
 
 def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
-    if source.sockets:
-        lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
+    if source.rows.sockets:
+        lines = distance_lines(source.csv, sheet, source.rows.sockets[-1], source.table.length)
         yield from (("", "", line) for line in lines)
-    if source.markers:
+    if source.rows.markers:
         yield from rotation(source)
         yield from deviations(source)
 
@@ -190,19 +190,14 @@ class Source:
     numbers: tuple[str, ...]
     tips: Sequence[str] = ()
 
-    @property
-    def markers(self) -> list[list[str]]:
-        """Columns of the markers."""
-        return self.rows.markers
-
-    @property
-    def sockets(self) -> tuple[str, ...]:
-        """Columns of place and socket."""
-        return tuple(self.rows.sockets)
-
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
-        columns = self._columns(table)
+        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
+        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
+        sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
+        markers = self.rows.markers or None
+        session = self.rows.session if markers else None
+        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
         data: Any = read_observations(self.csv, columns, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
@@ -220,13 +215,6 @@ class Source:
                 return None
         found = measured_positions(data)
         return None if found is None else found.largest_session()
-
-    def _columns(self, table: TableFormat) -> TableColumns:
-        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
-        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
-        sockets = SocketColumns(self.sockets) if self.sockets else None
-        session = self.rows.session if self.markers else None
-        return TableColumns(self.joints, self.markers or None, sockets, readings, session, self.robot.kinds)
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
@@ -258,19 +246,15 @@ class Source:
             return max(_in_images(self.robot, one) for one in tables)
         return identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
 
-    @property
-    def _in_metres(self) -> bool:
-        return not self.rows.without_length
-
     def size(self, residual: float) -> str:
         """A residual with its unit."""
-        return f"{1e3 * residual:.3g} mm" if self._in_metres else f"{100 * residual:.3g} %"
+        return f"{100 * residual:.3g} %" if self.rows.without_length else f"{1e3 * residual:.3g} mm"
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
         what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
-        what = "median residual of the nominal robot" if self._in_metres else what
+        what = what if self.rows.without_length else "median residual of the nominal robot"
         return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
 
 
@@ -335,9 +319,9 @@ def rotation(source: Source) -> Iterator[Entry]:
     Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
     option is empty says so.
     """
-    guessed = [guess_rotation(source.numbers, marker) for marker in source.markers]
+    guessed = [guess_rotation(source.numbers, marker) for marker in source.rows.markers]
     each = [names for names in guessed if names is not None and not set(names) & set(source.joints)]
-    alone = len(source.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
+    alone = len(source.rows.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
     if not each or len(each) < len(guessed) or not alone or len(guessed) != max(len(source.tips), 1):
         return
     names = [name for own in each for name in own]
@@ -366,7 +350,7 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
 
     Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
     """
-    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
+    names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
     if names is None or set(names) & set(source.joints):
         return
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
@@ -391,7 +375,7 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
 
 def deviations(source: Source) -> Iterator[Entry]:
     """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
-    names = guess_deviations(source.numbers, source.markers)
+    names = guess_deviations(source.numbers, source.rows.markers)
     if names is None:
         return
     data = source.positions(replace(source.table, std=names))

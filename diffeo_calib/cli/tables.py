@@ -261,7 +261,7 @@ class ProgramTable:
 
     def targets(self, robot: Tree, tools: int) -> Tensor | None:
         """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
-        position, rotation = self.given.position, self.given.rotation
+        given, position, rotation = self.given, self.given.position, self.given.rotation
         if not position:
             if rotation:
                 raise InputError.of("--rotation without --position", fix="name the columns of the position too")
@@ -269,8 +269,8 @@ class ProgramTable:
         if len(position) != tools:
             fix = "name the columns of the targets once for every --tip"
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
-        how = {"convention": self.given.convention, "rotation_angle": self.given.rotation_angle}
-        table = with_rows(self.table, Rows(rotation=rotation, **how)) if rotation else self.table
+        turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
+        table = with_rows(self.table, turned) if rotation else self.table
         names, triples = joint_columns(self.joints, robot), _position_triples(position)
         data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
         return data.points if data.poses is None else by_frame(data.poses)

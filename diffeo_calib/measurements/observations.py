@@ -5,7 +5,7 @@ The ball is one target: that of the rows in sockets, of the readings, and the la
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -77,11 +77,6 @@ class Observations(RowGroups):
         return _observations(_pieces(parts))
 
     @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self.q.shape[1]
-
-    @property
     def joint_names(self) -> tuple[str, ...] | None:
         """Names of the joints, in the order of the columns of ``q``."""
         return self.parts[0].joint_names
@@ -101,11 +96,6 @@ class Observations(RowGroups):
         """(N, K) values with which something may drift; None without any."""
         own = [part.covariates for part in self.parts]
         return None if own[0] is None else self._whole(own)
-
-    @property
-    def lines(self) -> Tensor:
-        """(N,) lines of the rows in their file, or their numbers."""
-        return self.line_numbers
 
     @property
     def file_sha256(self) -> str | None:
@@ -172,15 +162,6 @@ class Observations(RowGroups):
             for first, second in part.copies()
         ]
         return sorted(((min(pair), max(pair)) for pair in found), key=lambda pair: pair[1])
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index: object) -> Observations:
-        return self.rows(index)
-
-    def __iter__(self) -> Iterator[Observations]:
-        return (self.rows(i) for i in range(len(self)))
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint")

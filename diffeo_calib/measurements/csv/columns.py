@@ -16,8 +16,6 @@ from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
 
-MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
-
 
 @runtime_checkable
 class ChainLike(Protocol):
@@ -247,7 +245,7 @@ def _joint_columns(
         fix = "name a column for every joint of the robot, in its order"
         raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
     for kind in kinds:
-        check_choice("kinds", kind, MOVING_KINDS)
+        check_choice("kinds", kind, [known for known in KINDS if known != "fixed"])
     prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
     return tuple(name.strip() for name in joints), prismatic, known
 
