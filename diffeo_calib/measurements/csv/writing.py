@@ -114,7 +114,7 @@ def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> li
     return [numbers] if known is None else [numbers, known.rad2deg() if unit == "deg" else known]
 
 
-def csv_text(rows: Iterable[Sequence[object]], sep: str, end: str = "\r\n") -> bytes:
+def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
     """Rows of cells as CSV."""
     text = io.StringIO(newline="")
     csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
