@@ -47,9 +47,6 @@ def expanded(arguments: Sequence[str], known: Sequence[str], live: Sequence[str]
     Args:
         arguments: of the program. known: names of the options of `fit`, without dashes.
         live: the same of `campaign`, which leaves out entries of `fit` alone.
-
-    Raises:
-        InputError: the file cannot be read, is no TOML, or has an entry that is no option.
     """
     words = list(arguments)
     at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
@@ -131,10 +128,6 @@ def asked(arguments: Sequence[str], known: Sequence[str]) -> Fleet | None:
 
     Args:
         arguments: of the program. known: names of the options of `fit`, without dashes.
-
-    Raises:
-        InputError: --jobs without a campaign or without a number, options that campaigns cannot share, a campaign that
-            cannot be read, or two that write the same model.
     """
     if not arguments or arguments[0] != COMMAND:
         return None

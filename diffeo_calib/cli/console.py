@@ -53,9 +53,10 @@ out = Console(width=None if sys.stdout.isatty() else WIDTH)
 err = Console(stderr=True)
 
 
-def say(text: str) -> None:
-    """Print one line verbatim, with Python keywords as options: no markup, no colours, no wrapping."""
-    out.print(_as_options(plain(text)), highlight=False, soft_wrap=True)
+def say(*lines: str) -> None:
+    """Print lines verbatim, with Python keywords as options: no markup, no colours, no wrapping."""
+    for line in lines:
+        out.print(_as_options(plain(line)), highlight=False, soft_wrap=True)
 
 
 def show_error(error: object) -> None:

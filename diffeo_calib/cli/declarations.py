@@ -12,7 +12,6 @@ import typer
 
 from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
-from diffeo_calib.cli.live_options import LiveOptions
 from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
@@ -53,11 +52,7 @@ def fit_command(
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
-    files = fit.Outputs(output, given.figure, given.report)
-    how = {"holdout": given.holdout, "seed": given.seed, "controls": given.controls, "note": given.note}
-    how["scales_of"] = others
-    fit.run(links, measured_table(csv, rows, units, duplicates), files, **how)
+    fit.run(robot, measured_table(csv, rows, units, duplicates), output, given)
 
 
 @command("campaign")
@@ -66,7 +61,7 @@ def campaign_command(
     robot: options.Robot,
     units: options.Units,
     rows: options.Rows,
-    given: LiveOptions,
+    given: options.LiveOptions,
 ) -> None:
     """Judge rows while they are measured.
 
@@ -83,11 +78,10 @@ def campaign_command(
         raise InputError.of("--bag and --seen belong together", fix="name both, or none")
     if given.bag is not None and (given.once or given.stdin):
         raise InputError.of("--once and --stdin beside --bag, whose end is that of the campaign", fix="leave them out")
-    from diffeo_calib.cli.commands import campaign, fit  # noqa: PLC0415
+    from diffeo_calib.cli.commands import campaign  # noqa: PLC0415
     from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    links = fit.RobotFile(robot.robot, robot.base, robot.tip, robot.load or ())
-    campaign.run(links, measured_table(csv, rows, units), given)
+    campaign.run(robot, measured_table(csv, rows, units), given)
 
 
 @command("record")
@@ -146,9 +140,8 @@ def evaluate_command(
         raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
     check_outputs({"-o": given.output, "--residuals": given.residuals}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
-    evaluate.run(model, TableOptions(csv, rows, units), given)
+    evaluate.run(model, options.TableOptions(csv, rows, units), given)
 
 
 @command("init")
@@ -216,10 +209,9 @@ def predict_command(
     """
     check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli.commands import predict  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     rows = options.Rows(convention=convention, rotation_angle=rotation_angle, payload=payload)
-    predict.run(model, TableOptions(csv, rows, units), output)
+    predict.run(model, options.TableOptions(csv, rows, units), output)
 
 
 @command("correct")
@@ -350,11 +342,11 @@ def recalibrate_command(
     units: options.StoredUnits,
     output: options.ModelOutput,
     rows: options.Rows,
-    marker: options.Marker = options.MarkerFreedom.evidence,
+    marker: options.Marker = "evidence",
     drift: Annotated[
         options.Drift,
         typer.Option("--drift", help="tested: what a test names may have changed; none: device and markers only."),
-    ] = options.Drift.tested,
+    ] = "tested",
     seed: options.TestSeed = 0,
     note: options.Note = "",
 ) -> None:
@@ -367,10 +359,9 @@ def recalibrate_command(
     """
     check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     recalibrate.run(
-        old, TableOptions(csv, rows, units), output, recalibrate.Options(marker.value, drift.value, seed, note)
+        old, options.TableOptions(csv, rows, units), output, marker=marker, drift=drift, seed=seed, note=note
     )
 
 
@@ -383,7 +374,7 @@ def compare_command(
     ],
     units: options.StoredUnits,
     rows: options.Rows,
-    marker: options.Marker = options.MarkerFreedom.evidence,
+    marker: options.Marker = "evidence",
     level: Annotated[
         float,
         typer.Option(
@@ -405,7 +396,6 @@ def compare_command(
     """
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     if compare.is_model(other):
         if rows.named or units.length or units.angle:
@@ -415,7 +405,7 @@ def compare_command(
         return
     if figure is not None:
         raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
-    compare.run(old, TableOptions(other, rows, units), marker.value, level, seed)
+    compare.run(old, options.TableOptions(other, rows, units), marker, level, seed)
 
 
 @command("report")
@@ -433,12 +423,11 @@ def report_command(
     """
     check_outputs({"-o": output}, {"MODEL": model} | ({} if page.data is None else {"--data": page.data}))
     from diffeo_calib.cli.commands import report  # noqa: PLC0415
-    from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
     if page.data is None and (rows.named or units.length or units.angle or page.against):
         what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
         raise InputError.of(what, fix="name the table with --data, or leave them out")
-    report.run(model, output, None if page.data is None else TableOptions(page.data, rows, units), page)
+    report.run(model, output, None if page.data is None else options.TableOptions(page.data, rows, units), page)
 
 
 @command("demo")

@@ -69,11 +69,7 @@ class Sheet:
 
 
 def guess_sheet(path: Path) -> Sheet:
-    """The separator and decimal mark with which most columns are numbers.
-
-    Raises:
-        MeasurementError: with none of them the file is a table of numbers.
-    """
+    """The separator and decimal mark with which most columns are numbers."""
     found: list[Sheet] = []
     for sep in SEPARATORS:
         try:

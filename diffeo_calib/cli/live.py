@@ -14,7 +14,7 @@ from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Sent, as_line, che
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.live_options import LiveOptions
+from diffeo_calib.cli.options import LiveOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
@@ -180,11 +180,7 @@ class Live:
         self.journal.add(self._revised())
 
     def _append(self, row: Entry) -> int:
-        """Append a row to the table and judge it; the number of its line.
-
-        Raises:
-            InputError: no row of this table, or it cannot be written.
-        """
+        """Append a row to the table and judge it; the number of its line."""
         self.judge(self.new_lines())
         header, line = self.table.written(row)
         self._read([line], header, len(self.lines))

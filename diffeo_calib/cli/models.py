@@ -10,33 +10,29 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Rows, StoredUnits, Units
-from diffeo_calib.cli.tables import (
-    MeasuredTable,
-    TableOptions,
-    as_at_the_fit,
-    measured_table,
-    rows_in_table,
-    tool_frame,
-)
+from diffeo_calib.cli.options import Robot, Rows, StoredUnits, TableOptions, Units
+from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 
 def load_kinematics(path: Path) -> CalibratedKinematics:
-    """Load the model of a robot.
-
-    Raises:
-        InputError: the file cannot be read, or holds the model of another map.
-    """
+    """Load the model of a robot."""
     model = load(path)
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of(f"{path} is not a robot's model", fix="pass a file written by `diffeo-calib fit`")
     return model
+
+
+def load_robot(given: Robot) -> Tree:
+    """The robot in a URDF."""
+    return load_urdf(given.robot, given.base, list(dict.fromkeys(given.tip)), given.load or ())
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
@@ -44,9 +40,6 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
 
     Args:
         path: the file. mass: in the unit of the model's measurements; None for a model without payloads.
-
-    Raises:
-        InputError: a mass for a model without payloads, or none for another.
     """
     model = load_kinematics(path)
     if model.payload is not None and mass is None:
@@ -57,8 +50,7 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
 
 def planned(model: CalibratedKinematics, mass: float | None) -> tuple[CalibratedKinematics, Tensor]:
     """A model to plan with, of a robot that carries a mass, by default the median of the fit; its markers (P, 3), m."""
-    for line in provenance_lines(model):
-        say(line)
+    say(*provenance_lines(model))
     if mass is not None:
         model = model.with_payload(mass)
     elif model.payload is not None:
@@ -119,11 +111,7 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:
-    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text.
-
-    Raises:
-        InputError: no numbers of a tool, or the measured frame of a model of points.
-    """
+    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text."""
     if text is None:
         if tool_from != "tip":
             raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")

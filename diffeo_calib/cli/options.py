@@ -7,9 +7,8 @@ A group of options is a frozen dataclass: a command that has a parameter of this
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -34,64 +33,15 @@ def option(
     return field(metadata=said) if default is ... else field(default=default, metadata=said)
 
 
-class Length(str, Enum):
-    """Unit of positions and prismatic joints."""
-
-    m = "m"
-    mm = "mm"
-
-
-class Angle(str, Enum):
-    """Unit of angles."""
-
-    rad = "rad"
-    deg = "deg"
-
-
-class DH(str, Enum):
-    """Convention of Denavit-Hartenberg tables."""
-
-    standard = "standard"
-    craig = "craig"
-
-
-class Frame(str, Enum):
-    """Frame of targets."""
-
-    base = "base"
-    measuring = "measuring"
-
-
-class ToolFrom(str, Enum):
-    """Frame in which a tool centre point is given."""
-
-    tip = "tip"
-    measured = "measured"
-
-
-class Free(str, Enum):
-    """Parts of the set-up that may have moved."""
-
-    both = "both"
-    base = "base"
-    marker = "marker"
-
-
-class MarkerFreedom(str, Enum):
-    """How far the markers may have moved on the tool."""
-
-    evidence = "evidence"
-    same = "same"
-    moved = "moved"
-    other = "other"
-
-
-class Drift(str, Enum):
-    """Changes of the robot itself that are considered."""
-
-    tested = "tested"
-    none = "none"
-
+Length = Literal["m", "mm"]
+Angle = Literal["rad", "deg"]
+DH = Literal["standard", "craig"]
+Frame = Literal["base", "measuring"]
+ToolFrom = Literal["tip", "measured"]
+Free = Literal["both", "base", "marker"]
+"""Parts of the set-up that may have moved."""
+MarkerFreedom = Literal["evidence", "same", "moved", "other"]
+Drift = Literal["tested", "none"]
 
 # --- files, seeds, masses -----------------------------------------------------------------------------------------
 
@@ -125,14 +75,6 @@ Convention = Annotated[
 ]
 RotationAngle = Annotated[
     Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles and rotation vectors.")
-]
-Tip = Annotated[
-    list[str],
-    typer.Option(
-        "--tip",
-        metavar="LINK",
-        help="Last link of the chain, to which the markers are fixed; for several tips once per --position.",
-    ),
 ]
 PayloadColumn = Annotated[
     str | None,
@@ -243,6 +185,15 @@ class Rows:
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+@dataclass(frozen=True)
+class TableOptions:
+    """A table as a command with a model names it: the file, what its rows hold, how it is written."""
+
+    csv: Path
+    rows: Rows
+    units: StoredUnits
+
+
 # --- the commands that measure ------------------------------------------------------------------------------------
 
 
@@ -252,7 +203,11 @@ class Robot:
 
     robot: Path = option("The robot's description.", "URDF", default=...)
     base: str = option("First link of the chain.", "LINK", default=...)
-    tip: Tip
+    tip: list[str] = option(
+        "Last link of the chain, to which the markers are fixed; for several tips once per --position.",
+        "LINK",
+        default=...,
+    )
     load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
 
 
@@ -286,10 +241,7 @@ class EvaluateOptions:
     output: Path | None = option(
         "With --register: write the registered model to this file.",
         "MODEL",
-        names=(
-            "-o",
-            "--output",
-        ),
+        names=("-o", "--output"),
     )
     fail_above: str | None = option(
         "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
@@ -334,6 +286,39 @@ class BoardImages:
     decimal: str = option("Decimal mark of both tables.", default=".")
 
 
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How to follow a campaign."""
+
+    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
+    stdin: bool = option(
+        "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
+    )
+    listen: str | None = option(
+        "Take the same lines from a socket of this machine, 0 for any free port, and answer each: "
+        "campaign/feeds.py describes them. Addresses of other machines need --token.",
+        "[HOST:]PORT",
+    )
+    token: str = option(
+        "What a program must send first to --listen; other users of this machine see what is typed, not the variable.",
+        "TEXT",
+        default="",
+        envvar="DIFFEO_CALIB_TOKEN",
+    )
+    json_lines: bool = option(
+        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
+    )
+    bag: Path | None = option("Append the stops of a ROS 2 bag to CSV, at their times; see `record`.", "BAG")
+    seen: str | None = option("Topic of --bag: stamped points, poses or transforms that a device measured.", "TOPIC")
+    joint_states: str = option("Topic of --bag: joint states.", "TOPIC", default="/joint_states")
+    speed: float = option("How many times faster --bag is played than it was recorded.", min=1e-3, default=1.0)
+    once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
+    candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
+    page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
+    next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
+    accepted: Path | None = option("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
+
+
 # --- the commands that apply models -------------------------------------------------------------------------------
 
 
@@ -358,8 +343,8 @@ class Correction:
         "the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
-    tool_from: ToolFromOption = ToolFrom.tip
-    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default=Frame.base)
+    tool_from: ToolFromOption = "tip"
+    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default="base")
     limit: float | None = option(
         "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
     )
@@ -376,7 +361,7 @@ class Export:
     urdf: Path | None = option("Write the robot's own URDF with corrected joint origins.", "URDF")
     mjcf: Path | None = option("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = option("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
-    dh_convention: DH = option("Convention of --dh; craig is also called modified.", default=DH.standard)
+    dh_convention: DH = option("Convention of --dh; craig is also called modified.", default="standard")
     ur_kinematics: Path | None = option("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
     ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
     joint_offsets: Path | None = option("Write the best joint offsets, all other geometry nominal.", "CSV")
@@ -397,7 +382,7 @@ class Export:
         "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
         "X,Y,Z[,...]",
     )
-    tool_from: ToolFromOption = ToolFrom.tip
+    tool_from: ToolFromOption = "tip"
     frame: Frame | None = option(
         "Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the "
         "measuring device."
@@ -405,8 +390,8 @@ class Export:
     tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
     robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
     payload_mass: Mass = None
-    length: Length = option("Unit of lengths in the CSV files written.", default=Length.m)
-    angle: Angle = option("Unit of angles in the CSV files written.", default=Angle.rad)
+    length: Length = option("Unit of lengths in the CSV files written.", default="m")
+    angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
 
     @property
     def outputs(self) -> dict[str, Path | None]:

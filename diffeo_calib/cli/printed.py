@@ -126,8 +126,8 @@ def placement_lines(
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
 
 
-def _triple(values: Tensor) -> str:
-    return " ".join(f"{value:.3f}" for value in values.tolist())
+def _triple(values: Tensor, digits: str = ".3f") -> str:
+    return " ".join(f"{value:{digits}}" for value in values.tolist())
 
 
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
@@ -163,7 +163,7 @@ def frame_lines(found: Registration) -> Iterator[str]:
     yield f"the measuring frame of the model, seen from the new one: {moved}"
     deviations = found.frame_deviations
     shift, small = 1e3 * deviations[:3], torch.rad2deg(deviations[3:])
-    yield f"  known to {_short(shift)} mm at the middle of the rows, and to {_short(small)} deg"
+    yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(small, '.2g')} deg"
 
 
 def _marker_lines(found: Registration, tips: Sequence[str], *, sure: bool) -> Iterator[str]:
@@ -173,16 +173,12 @@ def _marker_lines(found: Registration, tips: Sequence[str], *, sure: bool) -> It
     places, tips = (middles(places[None])[0], tips[::POINTS]) if rigid else (places, tips)
     for k, (place, deviation, tip) in enumerate(zip(places, deviations, tips, strict=False)):
         what = "measured frame" if rigid else "marker" + f" {k}" * (len(places) > 1)
-        known = "" if rigid else f", known to {_short(1e3 * deviation)} mm"
+        known = "" if rigid else f", known to {_triple(1e3 * deviation, '.2g')} mm"
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"
     if found.shift is not None:
         largest = 1e3 * float(found.shift.norm(dim=1).max())
         stayed = "" if found.same_place is None or not sure else f" (unmoved with probability {found.same_place:.2f})"
         yield f"  that is {largest:.3f} mm from where it was{stayed}"
-
-
-def _short(values: Tensor) -> str:
-    return " ".join(f"{value:.2g}" for value in values.tolist())
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf
@@ -170,10 +170,10 @@ def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str
 
 def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
-    if source.sockets:
-        lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
+    if source.rows.sockets:
+        lines = distance_lines(source.csv, sheet, source.rows.sockets[-1], source.table.length)
         yield from (("", "", line) for line in lines)
-    if source.markers:
+    if source.rows.markers:
         yield from rotation(source)
         yield from deviations(source)
 
@@ -190,23 +190,14 @@ class Source:
     numbers: tuple[str, ...]
     tips: Sequence[str] = ()
 
-    @property
-    def markers(self) -> list[list[str]]:
-        """Columns of the markers."""
-        return self.rows.markers
-
-    @property
-    def sockets(self) -> tuple[str, ...]:
-        """Columns of place and socket."""
-        return tuple(self.rows.sockets)
-
     def read(self, table: TableFormat) -> Any:
-        """The rows in another format, of any kinds.
-
-        Raises:
-            DiffeoCalibError: they cannot be read so.
-        """
-        columns = self._columns(table)
+        """The rows in another format, of any kinds."""
+        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
+        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
+        sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
+        markers = self.rows.markers or None
+        session = self.rows.session if markers else None
+        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
         data: Any = read_observations(self.csv, columns, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
@@ -224,13 +215,6 @@ class Source:
                 return None
         found = measured_positions(data)
         return None if found is None else found.largest_session()
-
-    def _columns(self, table: TableFormat) -> TableColumns:
-        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
-        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
-        sockets = SocketColumns(self.sockets) if self.sockets else None
-        session = self.rows.session if self.markers else None
-        return TableColumns(self.joints, self.markers or None, sockets, readings, session, self.robot.kinds)
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
@@ -262,19 +246,15 @@ class Source:
             return max(_in_images(self.robot, one) for one in tables)
         return identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
 
-    @property
-    def _in_metres(self) -> bool:
-        return not self.rows.without_length
-
     def size(self, residual: float) -> str:
         """A residual with its unit."""
-        return f"{1e3 * residual:.3g} mm" if self._in_metres else f"{100 * residual:.3g} %"
+        return f"{100 * residual:.3g} %" if self.rows.without_length else f"{1e3 * residual:.3g} mm"
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
         what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
-        what = "median residual of the nominal robot" if self._in_metres else what
+        what = what if self.rows.without_length else "median residual of the nominal robot"
         return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
 
 
@@ -317,38 +297,50 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
+def _clear_reading(source: Source, formats: Mapping[Any, TableFormat], other: str) -> tuple[Any, str] | None:
+    """The format, by its key, with which the nominal robot explains the positions best, and why.
+
+    None unless it is clearly better than all others, which ``other`` names.
+    """
+    tables = {key: source.positions(table) for key, table in formats.items()}
+    residuals = {key: residual_of(source.robot, data) for key, data in tables.items() if data is not None}
+    found = min(residuals, key=lambda key: residuals[key], default=None)
+    others = [value for key, value in residuals.items() if key != found]
+    best = residuals.get(found, LARGEST_RESIDUAL)
+    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+        return None
+    than = f", {other} at least {1e3 * min(others):.3g} mm" if others else ""
+    return found, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+
+
 def rotation(source: Source) -> Iterator[Entry]:
     """(option, value, why) of a rotation: the convention with which the nominal robot explains the poses best.
 
     Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
     option is empty says so.
     """
-    found = [guess_rotation(source.numbers, marker) for marker in source.markers]
-    each = [names for names in found if names is not None and not set(names) & set(source.joints)]
-    alone = len(source.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
-    if not each or len(each) < len(found) or not alone or len(found) != max(len(source.tips), 1):
+    guessed = [guess_rotation(source.numbers, marker) for marker in source.rows.markers]
+    each = [names for names in guessed if names is not None and not set(names) & set(source.joints)]
+    alone = len(source.rows.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
+    if not each or len(each) < len(guessed) or not alone or len(guessed) != max(len(source.tips), 1):
         return
     names = [name for own in each for name in own]
     units = ("deg", "rad") if len(each[0]) == 3 else (None,)
     columns = each[0] if len(each) == 1 else each
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])]
-    residuals: dict[tuple[str, str | None], float] = {}
-    for convention, unit in product(conventions, units):
-        data = source.positions(replace(source.table, rotation=columns, convention=convention, rotation_angle=unit))
-        if data is not None:
-            residuals[convention, unit] = residual_of(source.robot, data)
-    (convention, unit), best = min(
-        residuals.items(), key=lambda entry: entry[1], default=(("", None), LARGEST_RESIDUAL)
-    )
-    others = [value for reading, value in residuals.items() if reading != (convention, unit)]
-    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+    formats = {
+        (name, unit): replace(source.table, rotation=columns, convention=name, rotation_angle=unit)
+        for name, unit in product(conventions, units)
+    }
+    found = _clear_reading(source, formats, "with any other convention or unit")
+    if found is None:
         yield "", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used"
         return
-    than = f", with any other convention or unit at least {1e3 * min(others):.3g} mm" if others else ""
+    (convention, unit), reason = found
     written = [",".join(own) for own in each]
     why = "by their names; without these three lines positions alone are calibrated"
     yield "rotation", written[0] if len(written) == 1 else written, why
-    yield "convention", convention, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    yield "convention", convention, reason
     if unit is not None:
         yield "rotation-angle", unit, "the same"
 
@@ -358,25 +350,21 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
 
     Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
     """
-    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
+    names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
     if names is None or set(names) & set(source.joints):
         return
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
     turns = ("deg", "rad") if len(names) == 3 else (None,)
-    residuals: dict[tuple[str, str, str, str | None], float] = {}
-    for length, angle, convention, unit in product(("m", "mm"), ("rad", "deg"), conventions, turns):
-        plain = TableFormat(length, angle, sheet.sep, sheet.decimal, names, convention, unit, camera_on_tool=True)
-        data = source.positions(plain)
-        if data is not None:
-            residuals[length, angle, convention, unit] = residual_of(source.robot, data)
-    if not residuals:
+    marks = sheet.sep, sheet.decimal
+    formats = {
+        key: TableFormat(*key[:2], *marks, names, *key[2:], camera_on_tool=True)
+        for key in product(("m", "mm"), ("rad", "deg"), conventions, turns)
+    }
+    found = _clear_reading(source, formats, "read in any other way")
+    if found is None:
         return
-    (length, angle, convention, unit), best = min(residuals.items(), key=lambda entry: entry[1])
-    others = sorted(residuals.values())[1:2]
-    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
-        return
-    than = f", read in any other way at least {1e3 * others[0]:.3g} mm" if others else ""
-    yield "length", length, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    (length, angle, convention, unit), reason = found
+    yield "length", length, reason
     yield "angle", angle, "the same"
     yield "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
     yield "convention", convention, "the same"
@@ -387,7 +375,7 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
 
 def deviations(source: Source) -> Iterator[Entry]:
     """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
-    names = guess_deviations(source.numbers, source.markers)
+    names = guess_deviations(source.numbers, source.rows.markers)
     if names is None:
         return
     data = source.positions(replace(source.table, std=names))

@@ -188,9 +188,6 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path], *, m
     Args:
         outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
         may_come: the argument whose file may not exist yet.
-
-    Raises:
-        InputError: with the option and its file.
     """
     wanted, record.path = record.path, None  # nothing is written there before the place has been checked
     named = {option: path for option, path in outputs.items() if path is not None}

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 import typer
@@ -20,38 +20,32 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Correction, Format, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
-from diffeo_calib.measurements.csv.images import ImageColumns, image_size
+from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
-UNKNOWN_ZERO_M = 1.0
-"""Standard deviation of the unknown zero of displacements: wide."""
 
 
 def table_format(units: Units) -> TableFormat:
     """The format of a table of points; the separator may be a tab written as \\t or tab."""
-    slides = None if units.joint_length is None else units.joint_length.value
     mark = "\t" if units.sep in ("\\t", "tab") else units.sep
-    return TableFormat(units.length.value, units.angle.value, mark, units.decimal, joint_length=slides)
+    return TableFormat(units.length, units.angle, mark, units.decimal, joint_length=units.joint_length)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with the columns of rotations, deviations, payloads and covariates; lever in the unit of length.
-
-    Raises:
-        InputError: a lever or a camera on the tool without a rotation.
-    """
+    """The same format with columns of rotations, deviations, payloads and covariates; lever in the unit of length."""
     if rows.lever is not None and rows.rotation is None:
         raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
     if rows.camera_on_tool and rows.rotation is None and not rows.images:
@@ -60,7 +54,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         table,
         rotation=_names_of_each(rows.rotation),
         convention=rows.convention,
-        rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
+        rotation_angle=rows.rotation_angle,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
         remounted=rows.remounted,
@@ -72,21 +66,8 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     )
 
 
-@dataclass(frozen=True)
-class TableOptions:
-    """A table as a command with a model names it: the file, what its rows hold, how it is written."""
-
-    csv: Path
-    rows: Rows
-    units: StoredUnits
-
-
 def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
-    """The table that options describe; exact repeats are kept by default.
-
-    Raises:
-        InputError: options that do not go together, or are not written as they should be.
-    """
+    """The table that options describe; exact repeats are kept by default."""
     check_place(rows)
     table = with_rows(table_format(units), rows)
     readings = readings_columns(rows.reading or (), rows)
@@ -120,9 +101,6 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     Args:
         command: that made the model, or the options of its table alone; empty where neither is known.
         rows: None for a table of joint values alone.
-
-    Raises:
-        InputError: units that are neither typed nor known, or options in the model that are none.
     """
     own = rows or Rows()
     groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
@@ -195,9 +173,12 @@ def _completed(group: Any, words: Sequence[str]) -> Any:
     for option, own in _read_options(words, type(group)).items():
         name, kind = options[option]
         texts = own[1::2]
-        of = {Length, Angle, float} & {*get_args(kind), kind}
-        values = [one(text) for text in texts for one in of or [str]]
-        several = any(get_args(one) for one in get_args(kind))
+        allowed = next((get_args(one) for one in (kind, *get_args(kind)) if get_origin(one) is Literal), texts)
+        wrong = [text for text in texts if text not in allowed]
+        if wrong:
+            raise ValueError(f"'{wrong[0]}' for {option}")
+        values = [float(text) for text in texts] if float in get_args(kind) else texts
+        several = any(get_origin(one) is list for one in get_args(kind))
         changes[name] = True if kind is bool else values if several else values[-1]
     return replace(group, **changes)
 
@@ -237,9 +218,6 @@ class MeasuredTable:
 
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
-
-        Raises:
-            InputError: not one tip for every marker.
         """
         triples = _position_triples(self.position) or None
         several = len(tips) > 1 and self.sockets is None and not self.readings
@@ -268,62 +246,43 @@ class ProgramTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        position: X,Y,Z of the targets of every tool; none if the commands' nominal poses are the targets.
-        rotation: columns of the targets' orientations.
         table: units, separator and decimal mark.
-        convention: how rotations are written. rotation_angle: unit of their angles.
+        given: columns of the targets of every tool; none if the commands' nominal poses are the targets.
     """
 
     csv: Path
     joints: str | None
-    position: list[str]
-    rotation: list[str]
     table: TableFormat
-    convention: str | None
-    rotation_angle: Angle | None
-
-    @classmethod
-    def of(cls, csv: Path, units: Units, given: Correction) -> ProgramTable:
-        """The program that the options of `correct` describe."""
-        targets = given.position or [], given.rotation or []
-        return cls(csv, units.joints, *targets, table_format(units), given.convention, given.rotation_angle)
+    given: Correction
 
     def commands(self, robot: Tree) -> Tensor:
         """(N, n) joint values, rad or m."""
         return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
 
     def targets(self, robot: Tree, tools: int) -> Tensor | None:
-        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none.
-
-        Raises:
-            InputError: a rotation without a position, or not one position for every tool.
-        """
-        if not self.position:
-            if self.rotation:
+        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
+        given, position, rotation = self.given, self.given.position, self.given.rotation
+        if not position:
+            if rotation:
                 raise InputError.of("--rotation without --position", fix="name the columns of the position too")
             return None
-        if len(self.position) != tools:
+        if len(position) != tools:
             fix = "name the columns of the targets once for every --tip"
-            raise InputError.of("--position", expected=f"{tools} of them", got=len(self.position), fix=fix)
-        turned = Rows(rotation=self.rotation or None, convention=self.convention, rotation_angle=self.rotation_angle)
-        table = with_rows(self.table, turned) if self.rotation else self.table
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
+            raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
+        turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
+        table = with_rows(self.table, turned) if rotation else self.table
+        names, triples = joint_columns(self.joints, robot), _position_triples(position)
         data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
         return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, a rotation vector without one."""
-        unit = None if self.rotation_angle is None else self.rotation_angle.value
-        plain = replace(self.table, convention=self.convention, rotation_angle=unit)
+        plain = replace(self.table, convention=self.given.convention, rotation_angle=self.given.rotation_angle)
         return plain.for_writing(rotation_std=False)
 
 
 def tool_frame(text: str, table: TableFormat) -> Tensor:
-    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m.
-
-    Raises:
-        InputError: another number of numbers.
-    """
+    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m."""
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
     words = text.split(",")
@@ -340,11 +299,7 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
 
 
 def joint_columns(joints: str | None, robot: Tree) -> list[str]:
-    """Names of the joint columns: those given, or the robot's.
-
-    Raises:
-        InputError: another number of names than joints, or the robot's own names in another order.
-    """
+    """Names of the joint columns: those given, or the robot's."""
     if not joints:
         return list(robot.joint_names)
     names = _split_names(joints)
@@ -380,11 +335,7 @@ def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | Non
 def socket_columns(
     socket: str | None, distance: list[str] | None, std: float | None, table: TableFormat
 ) -> SocketColumns | None:
-    """The options of sockets in SI units; None without sockets.
-
-    Raises:
-        InputError: a distance that is not written as A,B=LENGTH.
-    """
+    """The options of sockets in SI units; None without sockets."""
     if socket is None:
         return None
     known = dict(_distance(text, table) for text in distance or ())
@@ -416,14 +367,13 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
     """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
 
     Of several cameras each has a file, whose name without .yaml is that of the camera in the table.
-
-    Raises:
-        InputError: neither a size nor the file of a camera; several texts one of which is no file.
     """
     names = [text.removeprefix(CORNERS).strip() for text in texts]
-    size = image_size(names[0].split(","))
     if len(names) == 1:
-        return ImageColumns(read_camera(names[0]) if size is None else size, rows.camera_on_tool, rows.session)
+        width, _, height = names[0].partition(",")
+        sized = width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0
+        known = (int(width), int(height)) if sized else read_camera(names[0])
+        return ImageColumns(known, rows.camera_on_tool, rows.session)
     cameras = {Path(name).stem: read_camera(name) for name in names}
     if len(cameras) < len(names):
         fix = "name the file of each camera after the camera in the table, such as left.yaml"

@@ -177,7 +177,12 @@ def _texts(program: Program, settings: Settings, stem: str, prefix: str) -> dict
 
 
 def _constants(program: Program, settings: Settings) -> dict[str, Any]:
-    chain, flows = program.chain, _flows(program)
+    chain = program.chain
+    named = (
+        ("joint", "phi^-1: corrections of the joints", program.joint_flow),
+        ("task", "psi: corrections of positions", program.task_flow),
+    )
+    flows = [flow_constants(*flow) for flow in named if not flow[2].vanishes]
     terms = [term for flow in flows for term in flow["terms"]]
     coupled = not np.array_equal(chain.coupling, np.eye(len(chain.axes))) or bool(chain.coupling_offset.any())
     return {
@@ -213,14 +218,6 @@ def _runs(on: Sequence[int]) -> Iterator[tuple[int, tuple[int, int]]]:
         count = len(list(run))
         yield tip, (first, count)
         first += count
-
-
-def _flows(program: Program) -> list[dict[str, Any]]:
-    named = (
-        ("joint", "phi^-1: corrections of the joints", program.joint_flow),
-        ("task", "psi: corrections of positions", program.task_flow),
-    )
-    return [flow_constants(*flow) for flow in named if not flow[2].vanishes]
 
 
 def _settings(model: CalibratedKinematics, program: Program, tool: object, frame: str) -> Settings:

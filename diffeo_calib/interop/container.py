@@ -43,22 +43,16 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
         header = json.loads(text) if text is not None else None
         sealed = isinstance(header, dict) and header.pop("digest", None) == digest(header, arrays)
     except (SafetensorError, OSError, *UNSOUND) as error:
-        raise ModelFileError.of(
-            f"{path} cannot be read as a model file ({error})",
-            fix="it is damaged or cut short: copy or save it again",
-        ) from error
+        fix = "it is damaged or cut short: copy or save it again"
+        raise ModelFileError.of(f"{path} cannot be read as a model file ({error})", fix=fix) from error
     if not isinstance(header, dict):
         raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
     if header.get("format") != FORMAT:
-        raise ModelFileError.of(
-            f"{path} has format version {header.get('format')!r}",
-            expected=FORMAT,
-            fix="read it with the version that wrote it",
-        )
+        what, fix = f"{path} has format version {header.get('format')!r}", "read it with the version that wrote it"
+        raise ModelFileError.of(what, expected=FORMAT, fix=fix)
     if not sealed:
-        raise ModelFileError.of(
-            f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
-        )
+        what = f"{path} was damaged or edited: its checksum does not match"
+        raise ModelFileError.of(what, fix="save the model again")
     return header, arrays
 
 

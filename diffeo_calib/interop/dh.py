@@ -85,7 +85,7 @@ def dh_table(
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     chain = geometry.chain
     path, frames, end = zero_frames(geometry, tip)
-    numbers, before, after = links(frames, chain.axes[path], end, torch.eye(4, dtype=torch.float64, device=HOST))
+    numbers, start, after = links(frames, chain.axes[path], end, torch.eye(4, dtype=torch.float64, device=HOST))
     moving = [joint for joint in chain.joints if joint.kind != "fixed"]
     joints = [moving[number] for number in path]
     names = [joint.name for joint in joints]
@@ -100,8 +100,10 @@ def dh_table(
     tool = torch.linalg.inv(after[-1]) @ end
     if convention == "craig":
         tool = row_transform(replace(rows[-1], d=0.0, theta=0.0)) @ tool
-        rows = _as_craig(rows)
-    return DHTable(tuple(names), rows, convention, before, tool)
+        leading = [DHRow(0.0, 0.0, 0.0), *rows[:-1]]  # a joint's theta and d after the a, alpha, beta to its axis
+        pairs = zip(leading, rows, strict=True)
+        rows = [replace(row, a=before.a, alpha=before.alpha, beta=before.beta) for before, row in pairs]
+    return DHTable(tuple(names), rows, convention, start, tool)
 
 
 def write_dh(
@@ -233,12 +235,3 @@ def _forward(x: float, y: float) -> float:
 def _turned(x: float, y: float, angle: float) -> tuple[float, float]:
     c, s = cos(angle), sin(angle)
     return c * x - s * y, s * x + c * y
-
-
-def _as_craig(rows: Sequence[DHRow]) -> list[DHRow]:
-    """Craig's rows: a joint's own theta and d after the a, alpha and beta that lead to its axis."""
-    leading = [DHRow(0.0, 0.0, 0.0), *rows[:-1]]
-    return [
-        replace(row, a=before.a, alpha=before.alpha, beta=before.beta)
-        for before, row in zip(leading, rows, strict=True)
-    ]

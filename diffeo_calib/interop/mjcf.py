@@ -129,8 +129,9 @@ class _Links:
         if mass is None or inertia is None:
             return None
         try:
+            names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
             kilograms = float(mass.get("value", ""))
-            ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in MOMENTS)
+            ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in names)
             xyz, R = _place(element.find("origin"))
         except (TypeError, ValueError) as error:
             what = f"<inertial> of link '{self.name(joint)}' in the URDF"
@@ -138,9 +139,6 @@ class _Links:
         turned = R @ R.new_tensor([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.mT
         moments = turned[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         return {"mass": repr(kilograms), "pos": xyz, "fullinertia": _text(moments)}
-
-
-MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def _place(origin: Any) -> tuple[str, Tensor]:

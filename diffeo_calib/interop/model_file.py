@@ -20,13 +20,7 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileEr
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.container import ENTRY, UNSOUND, Header, digest, read_arrays
-from diffeo_calib.interop.model_header import (
-    KernelClasses,
-    MissingArgumentError,
-    Tensors,
-    describe,
-    rebuild,
-)
+from diffeo_calib.interop.model_header import KernelClasses, MissingArgumentError, Tensors, describe, rebuild
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.profiles import Profile, check_profile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -87,20 +81,15 @@ def load(
     except (ModelFileError, MissingArgumentError):
         raise
     except (*UNSOUND, DiffeoCalibError) as error:
-        raise ModelFileError.of(
-            f"{path} has contents that do not fit together ({error})", fix="save the model again"
-        ) from error
+        what = f"{path} has contents that do not fit together ({error})"
+        raise ModelFileError.of(what, fix="save the model again") from error
     for own in model.placement if isinstance(model, CalibratedKinematics) else ():
         own.warn_if_unknown()
     return model
 
 
 def _checked(kernels: object) -> KernelClasses:
-    """Classes of kernels and profiles by their names; classes of profiles are called without arguments.
-
-    Raises:
-        InputError: something else, or a profile with wrong derivatives.
-    """
+    """Classes of kernels and profiles by their names; classes of profiles are called without arguments."""
     if kernels is None:
         return {}
     if not isinstance(kernels, Mapping) or not all(map(_is_kernel, kernels.values())):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -132,9 +133,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if isinstance(nominal, SmoothMap):
         return {"kind": "function"}, {"probe": nominal.function(x[:PROBE_CONFIGURATIONS])}
     if not isinstance(nominal, GeometryMap):
-        raise InputError.of(
-            "the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__
-        )
+        got = type(nominal).__name__
+        raise InputError.of("the nominal map cannot be saved", expected="a robot or a function", got=got)
     geometry, chain = nominal.geometry, nominal.geometry.chain
     robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
@@ -142,7 +142,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if nominal.waves.size:
         robot["waves"] = nominal.waves.to_config()
     if nominal.payload is not None:
-        robot["payload"] = describe_payload(nominal.payload)
+        carried = nominal.payload
+        robot["payload"] = {"link": carried.link, "mass": float(carried.masses), "unit": carried.unit}
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
 
@@ -172,9 +173,8 @@ def rebuild(
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
     if set(header) - OPTIONAL != known or header["units"] != UNITS:
-        raise ModelFileError.of(
-            "the header of the model file is not understood", expected=sorted(known), got=sorted(header)
-        )
+        what = "the header of the model file is not understood"
+        raise ModelFileError.of(what, expected=sorted(known), got=sorted(header))
     x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
     nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal, header.get("urdf"))
     _check_sizes(header, tensors, nominal_map)
@@ -274,14 +274,12 @@ def _rebuild_nominal(
 ) -> NominalMap:
     if description["kind"] == "function":
         if nominal is None:
-            raise MissingArgumentError.of(
-                "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
-            )
+            what = "`nominal` is missing: this model deforms a plain function"
+            raise MissingArgumentError.of(what, fix="pass the same function again")
         value = nominal(tensors["x"][:PROBE_CONFIGURATIONS])
         if value.shape != tensors["probe"].shape or not torch.allclose(value, tensors["probe"], rtol=1e-9, atol=1e-12):
-            raise MissingArgumentError.of(
-                "`nominal` is not the map that the model was fitted to", fix="pass the same function"
-            )
+            what = "`nominal` is not the map that the model was fitted to"
+            raise MissingArgumentError.of(what, fix="pass the same function")
         return SmoothMap(nominal)
     if description["kind"] != "robot":
         raise ModelFileError.of("the kind of nominal map", expected="robot or function", got=description["kind"])
@@ -298,18 +296,18 @@ def _rebuild_nominal(
 
 
 def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
-    kernels = [_rebuild_term(term, classes) for term in terms]
+    kernels: list[Kernel] = []
+    for term in terms:
+        if "kernel" not in term:
+            own = partial(_own_profile, values=term.get(PROBE), classes=classes)
+            kernels.append(RadialKernel.from_config(term, own))
+            continue
+        name = term["kernel"]
+        found = classes.get(name)
+        if not (isinstance(found, type) and issubclass(found, Kernel)):
+            raise _missing(f"kernel {name!r}", f"its class: load(path, kernels={{{name!r}: ...}})", classes)
+        kernels.append(found.from_config(term["arguments"]))
     return kernels[0] if len(kernels) == 1 else SumKernel(kernels)
-
-
-def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
-    if "kernel" not in term:
-        return RadialKernel.from_config(term, lambda name: _own_profile(name, term.get(PROBE), classes))
-    name = term["kernel"]
-    found = classes.get(name)
-    if not (isinstance(found, type) and issubclass(found, Kernel)):
-        raise _missing(f"kernel {name!r}", f"its class: load(path, kernels={{{name!r}: ...}})", classes)
-    return found.from_config(term["arguments"])
 
 
 def _missing(what: str, fix: str, classes: KernelClasses) -> MissingArgumentError:
@@ -326,9 +324,8 @@ def _own_profile(name: str, values: list[float] | None, classes: KernelClasses) 
         fix = f"it, with the parameters of the fit: load(path, kernels={{{name!r}: YourProfile(...)}})"
         raise _missing(f"profile {name!r}", fix, classes)
     if values is None:
-        warn_user(
-            f"the model file is of an old version: whether the profile {name!r} is that of its fit is not checked"
-        )
+        text = "the model file is of an old version: whether the profile"
+        warn_user(f"{text} {name!r} is that of its fit is not checked")
         return profile
     own = torch.tensor([probe(profile), values], dtype=torch.float64, device=HOST)
     if not torch.allclose(own[0], own[1], rtol=PROBE_TOLERANCE, atol=0.0):
@@ -348,11 +345,6 @@ controls' markers before the task-space flow, and theta of a robot for which the
 own weight."""
 
 
-def describe_payload(payload: Payload) -> dict[str, Any]:
-    """The entry of a robot that carries one payload in all queries."""
-    return {"link": payload.link, "mass": float(payload.masses), "unit": payload.unit}
-
-
 def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
     """The tensors of a map; none without payloads."""
     spec, theta = fitted.geodesic.spec, fitted.geodesic.momenta.theta
@@ -368,7 +360,7 @@ def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
 
 
 def rebuild_payload(entry: Mapping[str, Any] | None) -> Payload | None:
-    """The inverse of :func:`describe_payload`.
+    """The payload that a robot carries in all queries, by its entry.
 
     Raises:
         InputError: numbers that are no masses.

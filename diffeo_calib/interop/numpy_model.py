@@ -39,9 +39,6 @@ class NumpyKinematics:
         """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.
 
         Data frames are taken by the names of the joints, here and below.
-
-        Raises:
-            InputError: wrong shape, or values that are not finite.
         """
         return self.program.points(self._joints(q))
 
@@ -142,13 +139,6 @@ def _frame(frame: str) -> str:
     return frame
 
 
-def _steps(steps: object) -> int:
-    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
-        expected = f"an integer of at least 1 and at most {MOST_STEPS}"
-        raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
-    return steps
-
-
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     nominal, integrator = header["nominal"], header["integrator"]
     if nominal["kind"] != "robot":
@@ -171,7 +161,10 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     sag = theta[size + arrays["tool"].size : last] if nominal["elastic"] else None
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
     k0 = replace(k0, waves=waves_of(waves, k0.n, theta[last:]))
-    tableau, steps = TABLEAUS[integrator["kind"]](), _steps(integrator["steps"])
+    tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
+    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
+        expected = f"an integer of at least 1 and at most {MOST_STEPS}"
+        raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip = k0.poses(xi[0])[:, on]  # (N, P, 4, 4)
     own = markers  # of every control: those of its session

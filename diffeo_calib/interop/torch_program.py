@@ -176,7 +176,12 @@ def export_onnx(
     Raises:
         InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
     """
-    _check_onnx()
+    try:
+        for name in ("onnx", "onnxscript"):
+            import_module(name)
+    except ImportError as error:
+        what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
+        raise InputError.of(what, fix=fix) from error
     check_writable(path)  # recording takes too long to find out afterwards
     module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
     with warnings.catch_warnings():
@@ -230,16 +235,6 @@ def _example(model: CalibratedKinematics | FittedMap, dtype: torch.dtype) -> Ten
     return x[torch.arange(EXAMPLE_ROWS, device=x.device) % len(x)].detach().to(dtype)
 
 
-def _check_onnx() -> None:
-    """Raise InputError unless the packages for ONNX files are installed."""
-    try:
-        for name in ("onnx", "onnxscript"):
-            import_module(name)
-    except ImportError as error:
-        what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
-        raise InputError.of(what, fix=fix) from error
-
-
 def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool: object, dtype: torch.dtype) -> None:
     if not isinstance(model, (CalibratedKinematics, FittedMap)):
         fix = "pass `result.model` or `fit.model`"
@@ -257,11 +252,7 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
 
 
 def _exact(model: CalibratedKinematics | FittedMap) -> GeodesicDeformation:
-    """The model's deformation.
-
-    Raises:
-        InputError: none with constant stages.
-    """
+    """The model's deformation."""
     fitted = model.map if isinstance(model, CalibratedKinematics) else model
     deformation = fitted.deformation
     if not isinstance(deformation, GeodesicDeformation):

@@ -116,11 +116,7 @@ def _number(value: float) -> str:
 
 
 def _prefix(chain: Tree) -> str:
-    """Prefix of the names of a Universal Robots arm's joints and links; often empty.
-
-    Raises:
-        RobotError: another robot, or another base.
-    """
+    """Prefix of the names of a Universal Robots arm's joints and links; often empty."""
     fix = "this format is for Universal Robots arms only: write a URDF (--urdf) instead"
     names = chain.moving_names
     prefix = names[0].removesuffix(JOINTS[0])

@@ -353,9 +353,7 @@ class FreePoints:
     old: Tensor
     shift: Tensor
 
-    @property
-    def lever(self) -> None:
-        """None."""
+    lever = None
 
     @property
     def points(self) -> Tensor:

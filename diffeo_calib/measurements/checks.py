@@ -22,14 +22,19 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 
 LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
 """Few axes turn further, so larger values are probably degrees."""
-LARGEST_POSITION_M = 100.0
-"""Few measurement volumes are larger, so larger values are probably millimetres."""
-SMALLEST_POSITION_MM = 10.0
-"""Few measurement volumes are smaller, so smaller values are probably metres."""
-SMALLEST_SLIDE_MM = 2.0
-"""Few prismatic joints move less, so smaller values are probably metres."""
-LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
-"""No rotation is written with larger values, apart from rounding."""
+USUAL_SIZES = {
+    "angles": (LARGEST_JOINT_ANGLE_RAD, 2 * math.pi),
+    "rotations": (2 * math.pi + 0.01, 2 * math.pi),
+    "positions": (100.0, 10.0),
+    "prismatic joints": (100.0, 2.0),
+}
+"""Larger values in rad or m, and smaller ones in deg or mm, are probably in the other unit."""
+OTHER_UNITS = {
+    "rad": ("deg", "degrees"),
+    "deg": ("rad", "radians"),
+    "m": ("mm", "millimetres"),
+    "mm": ("m", "metres"),
+}
 
 
 ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))
@@ -46,47 +51,23 @@ def in_other_unit(ratio: float, tolerance: float) -> bool:
     return any(abs(ratio * factor - 1.0) < tolerance for factor in (1e-3, 1e3))
 
 
-def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
-    """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
-    if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:
-        text = f"angles reach {largest:g} rad: they look like degrees"
-        if kinds_known:
-            return [f"{text}; pass angle='deg' if they are."]
+def unlikely_units(what: str, largest: float, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
+    """A sentence about values that reach ``largest`` in ``unit``, if that is unusual.
+
+    Args:
+        what: of USUAL_SIZES. option: argument that names their unit.
+        kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
+    """
+    most, least = USUAL_SIZES[what]
+    small = unit in ("deg", "mm")
+    if not (0 < largest <= least if small else largest > most):
+        return []
+    other, words = OTHER_UNITS[unit]
+    text = f"{what} reach {'only ' * small}{largest:g} {unit}: they look like {words}"
+    if not small and not kinds_known:
         slide = "or like millimetres of a prismatic joint; pass the robot, which knows its prismatic joints"
-        return [f"{text}, {slide}, or angle='deg' if they are degrees."]
-    if unit == "deg" and 0 < largest <= 2 * math.pi:
-        return [f"angles reach only {largest:g} deg: they look like radians; pass angle='rad' if they are."]
-    return []
-
-
-def unlikely_slide_units(largest: float, unit: str) -> list[str]:
-    """Sentences about prismatic joints that reach ``largest`` in ``unit``, "m" or "mm"."""
-    if unit == "m" and largest > LARGEST_POSITION_M:
-        text = f"prismatic joints reach {largest:g} m: they look like millimetres"
-        return [f"{text}; pass joint_length='mm' if they are."]
-    if unit == "mm" and 0 < largest < SMALLEST_SLIDE_MM:
-        text = f"prismatic joints reach only {largest:g} mm: they look like metres"
-        return [f"{text}; pass joint_length='m' if they are."]
-    return []
-
-
-def unlikely_position_units(largest: float, unit: str) -> list[str]:
-    """Sentences about positions that reach ``largest`` in ``unit``, "m" or "mm"."""
-    if unit == "m" and largest > LARGEST_POSITION_M:
-        return [f"positions reach {largest:g} m: they look like millimetres; pass length='mm' if they are."]
-    if unit == "mm" and 0 < largest < SMALLEST_POSITION_MM:
-        return [f"positions reach only {largest:g} mm: they look like metres; pass length='m' if they are."]
-    return []
-
-
-def unlikely_rotation_units(largest: float, unit: str) -> list[str]:
-    """Sentences about Euler angles or rotation vectors that reach ``largest`` in ``unit``, "rad" or "deg"."""
-    if unit == "rad" and largest > LARGEST_ROTATION_RAD:
-        return [f"rotations reach {largest:g} rad: they look like degrees; pass rotation_angle='deg' if they are."]
-    if unit == "deg" and 0 < largest <= 2 * math.pi:
-        text = f"rotations reach only {largest:g} deg: they look like radians"
-        return [f"{text}; pass rotation_angle='rad' if they are."]
-    return []
+        return [f"{text}, {slide}, or {option}='{other}' if they are {words}."]
+    return [f"{text}; pass {option}='{other}' if they are."]
 
 
 def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
@@ -109,8 +90,7 @@ def row_names(names: object, rows: int, what: str) -> list[str]:
         raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=as_written(names))
     given = names.tolist() if isinstance(names, Tensor) else list(names)
     if len(given) != rows:
-        got = len(given)
-        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got)
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given))
     empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
     texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
     unnamed = [row for row, text in enumerate(texts) if not text]
@@ -284,13 +264,11 @@ def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) 
         got = few([type(name).__name__ for name in names])
         raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=f"pass one name per {each}")
     if len(names) != count:
-        raise MeasurementError.of(
-            f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"
-        )
+        got = f"{len(names)} ({names})"
+        raise MeasurementError.of(f"`{what}`", expected=count, got=got, fix=f"pass one per {each}")
     if len(set(names)) < len(names):
-        raise MeasurementError.of(
-            f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
-        )
+        fix = "rename the repeated ones"
+        raise MeasurementError.of(f"`{what}`", expected="distinct names", got=list(names), fix=fix)
     return names
 
 
@@ -315,7 +293,10 @@ def marker_places(points: object) -> Tensor:
     if not bool(empty.any()):
         return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
     _check_whole(empty)
-    _check_rows_seen(empty.all(2))
+    rows = empty.all(2).all(1).nonzero()[:, 0].tolist()
+    if rows:
+        what = f"`points`, row {few(rows)}: no marker was seen"
+        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
     return places.masked_fill(empty, torch.nan)
 
 
@@ -346,11 +327,3 @@ def _check_whole(empty: Tensor) -> None:
         what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
         expected = "three finite numbers, or NaN for all three of a hidden marker"
         raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
-
-
-def _check_rows_seen(hidden: Tensor) -> None:
-    """Refuse rows without any marker: (N, P) boolean."""
-    rows = hidden.all(1).nonzero()[:, 0].tolist()
-    if rows:
-        what = f"`points`, row {few(rows)}: no marker was seen"
-        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")

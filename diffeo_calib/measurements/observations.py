@@ -5,7 +5,7 @@ The ball is one target: that of the rows in sockets, of the readings, and the la
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -77,11 +77,6 @@ class Observations(RowGroups):
         return _observations(_pieces(parts))
 
     @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self.q.shape[1]
-
-    @property
     def joint_names(self) -> tuple[str, ...] | None:
         """Names of the joints, in the order of the columns of ``q``."""
         return self.parts[0].joint_names
@@ -101,11 +96,6 @@ class Observations(RowGroups):
         """(N, K) values with which something may drift; None without any."""
         own = [part.covariates for part in self.parts]
         return None if own[0] is None else self._whole(own)
-
-    @property
-    def lines(self) -> Tensor:
-        """(N,) lines of the rows in their file, or their numbers."""
-        return self.line_numbers
 
     @property
     def file_sha256(self) -> str | None:
@@ -172,15 +162,6 @@ class Observations(RowGroups):
             for first, second in part.copies()
         ]
         return sorted(((min(pair), max(pair)) for pair in found), key=lambda pair: pair[1])
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index: object) -> Observations:
-        return self.rows(index)
-
-    def __iter__(self) -> Iterator[Observations]:
-        return (self.rows(i) for i in range(len(self)))
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint")
@@ -280,15 +261,11 @@ def joined_tables(tables: Sequence[Any]) -> Any:
         found = _observations(pieces)
         part, rows = next(zip(found.parts, found.index, strict=True))
         return found if len(found.parts) > 1 else part.rows(rows.argsort())
+    own = [piece.table for piece in pieces]
     if all(isinstance(table, RowTable) for table in tables):
-        return _in_one(tables)
-    whole = _in_one([piece.table for piece in pieces])
+        return type(tables[0]).in_one(tables)
+    whole = type(own[0]).in_one(own)
     return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
-
-
-def _in_one(tables: Sequence[Any]) -> Any:
-    """Tables of one kind, or of positions and sockets, as one."""
-    return type(tables[0]).in_one(tables)
 
 
 class _Piece(NamedTuple):
@@ -323,7 +300,7 @@ def _observations(pieces: Sequence[_Piece]) -> Observations:
         whole = [_Piece(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
     for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
-    parts = [_in_one([piece.table for piece in group]) for group in groups.values()]
+    parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
     return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
 
 

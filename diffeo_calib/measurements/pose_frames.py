@@ -181,7 +181,11 @@ def pose_columns(
     try:
         frames, board = checked_frames(poses).to(q.device), None
         if camera_on_tool:
-            frames, board = _camera_in_board(frames)
+            if frames.shape[1] > 1:
+                what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the poses"
+                fix += " of the cameras in the board's frame"
+                raise InputError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
+            frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
         points = points_of_frames(frames, lever)
     except InputError as error:
         raise MeasurementError(str(error)) from None
@@ -192,14 +196,6 @@ def pose_columns(
     rotations = turns[:, 0] if single and turns is not None else turns
     known = {"std": std, "rotation_std": rotations, "board": board}
     return {"poses": of_frames(frames), "points": points} | known
-
-
-def _camera_in_board(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse poses of one frame (N, 1, 4, 4), and the place (N, 3) of the board in the camera's frame, m."""
-    if frames.shape[1] > 1:
-        fix = "calibrate each arm with its own camera, or give the poses of the cameras in the board's frame"
-        raise InputError.of("poses of a camera on the tool", expected="one tip", got=frames.shape[1], fix=fix)
-    return inverse_poses(frames), frames[:, 0, :3, 3]
 
 
 def _deviations(value: object, name: str, places: Tensor) -> Tensor | None:

@@ -90,8 +90,11 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
     table = as_tensor(values, "rotations", ("N", count), fix=fix).detach()
     if count == 9:
         return nearest_rotations(table.unflatten(1, (3, 3)), place)
-    if count == 4:
-        _check_lengths(table, place)
+    off = (table.norm(dim=1) - 1).abs() > TOLERANCE
+    if count == 4 and off.any():
+        row = int(off.nonzero()[0])
+        expected, fix = f"a quaternion of length 1 to {TOLERANCE:g}", "check the order of the columns"
+        raise InputError.of(place(row), expected=expected, got=f"{float(table[row].norm()):.6g}", fix=fix)
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, needed for poses only
 
     numbers, degrees = table.cpu().numpy(), angle == "deg"
@@ -281,12 +284,3 @@ def _check_unit(angle: object) -> None:
     if angle not in ANGLE_UNITS:
         fix = "pass the unit of the rotations"
         raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
-
-
-def _check_lengths(quaternions: Tensor, place: Place) -> None:
-    length = quaternions.norm(dim=1)
-    bad = (length - 1).abs() > TOLERANCE
-    if bad.any():
-        row = int(bad.nonzero()[0])
-        expected, fix = f"a quaternion of length 1 to {TOLERANCE:g}", "check the order of the columns"
-        raise InputError.of(place(row), expected=expected, got=f"{float(length[row]):.6g}", fix=fix)

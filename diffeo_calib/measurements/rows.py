@@ -147,6 +147,26 @@ class RowGroups:
     """Rows that are divided, with repeated configurations kept together, and the sockets of a place."""
 
     q: Tensor
+    line_numbers: Tensor
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def lines(self) -> Tensor:
+        """(N,) lines of the rows in their file, or their numbers."""
+        return self.line_numbers
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index: object) -> Self:
+        return self.rows(index)
+
+    def __iter__(self) -> Iterator[Self]:
+        return (self.rows(i) for i in range(len(self)))
 
     def rows(self, index: object) -> Self:
         """Some of the rows."""
@@ -282,21 +302,14 @@ class RowTable(RowGroups):
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
 
-    q: Tensor
     joint_names: tuple[str, ...] | None
     payload: Tensor | None
     payload_at: str | None
-    line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
     covariates: Tensor | None = None
     """(N, K) values with which something may drift, such as times and temperatures, in any unit."""
     covariate_names: tuple[str, ...] = ()
-
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self.q.shape[1]
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -309,24 +322,10 @@ class RowTable(RowGroups):
         return (torch.arange(len(self), device=HOST),)
 
     @property
-    def lines(self) -> Tensor:
-        """(N,) lines of the rows in their file, or their numbers."""
-        return self.line_numbers
-
-    @property
     def columns(self) -> dict[str, Tensor]:
         """The columns that this table has, by name."""
         found = {name: getattr(self, name) for name in self.BY_ROW}
         return {name: values for name, values in found.items() if values is not None}
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index: object) -> Self:
-        return self.rows(index)
-
-    def __iter__(self) -> Iterator[Self]:
-        return (self.rows(i) for i in range(len(self)))
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""

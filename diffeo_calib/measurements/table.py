@@ -45,7 +45,7 @@ from diffeo_calib.measurements.pose_frames import (
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.sockets import Distances, Sockets, SocketTable, socket_numbers
+from diffeo_calib.measurements.sockets import Distances, SocketTable, socket_numbers
 
 
 @methods_outside_inference_mode
@@ -99,26 +99,9 @@ class Measurements(ImageTable, SocketTable):
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
 
-    q: Tensor
-    points: Tensor
-    joint_names: tuple[str, ...] | None
-    marker_names: tuple[str, ...] | None
-    on: tuple[str, ...] | None
     poses: Tensor | None
     lever: float | None
-    board: Tensor | None
-    std: Tensor | None
     rotation_std: Tensor | None
-    session: Tensor | None
-    session_names: tuple[str, ...]
-    remounted: bool
-    payload: Tensor | None
-    payload_at: str | None
-    socket: Tensor | None
-    sockets: Sockets | None
-    line_numbers: Tensor
-    file_sha256: str | None
-    origin: object | None
 
     def __init__(
         self,

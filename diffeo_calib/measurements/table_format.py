@@ -22,25 +22,10 @@ class TableFormat:
     """How a table of measurements or predictions is written.
 
     Args:
-        length: unit of the positions, ``"m"`` or ``"mm"``.
-        angle: unit of the revolute joints, ``"rad"`` or ``"deg"``.
-        sep: one character between cells.
-        decimal: ``"."`` or ``","``.
-        rotation: names of the columns of the tool's rotation, or one such list for each of several measured frames;
-            None for a table of points.
-        convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
-            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
-        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
-        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
-        std: names of the columns with standard deviations of the positions, in the unit of length: one for all, one
-            per marker or three per marker.
-        rotation_std: names of the columns with standard deviations of the rotation about the axes of the measuring
-            frame: one for all, or a list of one or three for each frame.
-        joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
-        payload: name of the column with the known mass that the robot carries, in any unit.
-        time, temperature: names of columns with which something may drift, in any unit.
-        camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
         remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
+
+    The others are as in :func:`read_measurements`: units, marks, and names of columns, those of rotations None for a
+    table of points.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -71,9 +56,8 @@ class TableFormat:
         check_choice("decimal", self.decimal, (".", ","))
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
-            raise MeasurementError.of(
-                "`sep`", expected="one character", got=as_written(sep), fix="pass ',' or ';' or '\\t'"
-            )
+            fix = "pass ',' or ';' or '\\t'"
+            raise MeasurementError.of("`sep`", expected="one character", got=as_written(sep), fix=fix)
         if sep == self.decimal:
             fix = "pass sep=';' if the numbers have decimal commas"
             got = f"{sep!r} for both"
@@ -112,7 +96,11 @@ class TableFormat:
             MeasurementError: a convention or unit that is missing, unknown or not needed, or a wrong number of names.
         """
         if self.rotation is None:
-            self._check_no_rotation_options()
+            options = ("convention", "rotation_angle", "rotation_std")
+            names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
+            if names or self.camera_on_tool:
+                fix = "name the columns of the rotation too, or leave this out"
+                raise MeasurementError.of(f"{names or '`camera_on_tool`'} without `rotation`", fix=fix)
             return self
         if self.convention is None:
             what = "`rotation` is given, but its `convention` is not"
@@ -146,14 +134,6 @@ class TableFormat:
             given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
             std = _by_frame("rotation_std", given, "three names", 3)
         return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
-
-    def _check_no_rotation_options(self) -> None:
-        options = ("convention", "rotation_angle", "rotation_std")
-        names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
-        names = names or "`camera_on_tool`" * self.camera_on_tool
-        if names:
-            fix = "name the columns of the rotation too, or leave this out"
-            raise MeasurementError.of(f"{names} without `rotation`", fix=fix)
 
     def _check_rotation_unit(self, *, has_angles: bool) -> None:
         """The unit of a rotation must be named where there are angles, and only there."""

@@ -30,9 +30,6 @@ SHOWN_ROWS, SHOWN_POSES = 8, 500
 """The last rows, and poses."""
 ALIVE_SECONDS = 10.0
 """After this long without news, the page receives a sign of life; closed ones are noticed then."""
-HEADER = "X-Campaign"
-LINE = re.compile("[0-9]{1,9}")
-"""The number of a line."""
 
 
 class Page(Server, HTTPServer):
@@ -154,11 +151,11 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """A decision about a row, such as /reject?line=N."""
         line = self._query.get("line", [""])[0]
-        if not self._allowed() or self.headers.get(HEADER) is None:
+        if not self._allowed() or self.headers.get("X-Campaign") is None:
             self.send_error(403)
         elif self._parts.path not in PATHS:
             self.send_error(404)
-        elif not LINE.fullmatch(line):
+        elif not re.fullmatch("[0-9]{1,9}", line):
             self.send_error(400)
         else:
             self.server.decisions.put(Sent({"do": self._parts.path[1:], "line": int(line)}))

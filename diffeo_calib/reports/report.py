@@ -11,12 +11,12 @@ from typing import Any
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import printable, shown
+from diffeo_calib.common.errors import InputError, printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find, refuse_columns
+from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find
 from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import kinds, sections, sentences
@@ -73,7 +73,9 @@ def write_report(
         found = find(model, data, stages=stages, against=against, progress=progress)
         words, made = sentences, sections.sections(found, progress)
     else:
-        refuse_columns(against)
+        if against:
+            got, fix = ", ".join(against), "leave them out: this page shows errors of each kind of rows in its own unit"
+            raise InputError.of("`against`", expected="a table of measured positions", got=got, fix=fix)
         found = find_kinds(model, data, stages=stages, places=places, progress=progress)
         words, made = kinds, kinds.sections(found)
     shown_page = page(found, words, made, title, None if data is None else data.sha256)
@@ -94,26 +96,19 @@ def judged(found: Findings | KindFindings, tolerance: float | None) -> str:
 
 
 def page(
-    found: Findings | KindFindings, words: ModuleType, made: Iterable[Section], title: str, data_sha256: str | None
+    found: Findings | KindFindings, words: ModuleType, parts: Iterable[Section], title: str, data_sha256: str | None
 ) -> Page:
     """The page about these findings: what ``words`` say about them, these sections, and the record of the model."""
-    (name, fit), summary = _names(found.model, title), found.model.summary
+    model, robot, made, summary = found.model, found.model.robot, found.model.provenance, found.model.summary
+    date = "" if made is None else f", fitted {made.date[:10]}"
+    note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
+    fit = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}"
     return Page(
-        title=name,
+        title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {words.rows_of(found)}.",
         verdict=words.verdict(found),
         warnings=(summary.warnings or "").splitlines() if summary else [],
         advice=list(words.advice(found)),
         figures=dict(words.figures(found)),
-        sections=[*made, sections.record(found.model, data_sha256 if found.new else None)],
+        sections=[*parts, sections.record(model, data_sha256 if found.new else None)],
     )
-
-
-def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:
-    """Title of a page, and what the model was fitted to."""
-    robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
-    made = model.provenance
-    date = "" if made is None else f", fitted {made.date[:10]}"
-    note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
-    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}"
-    return printable(title or f"Robot {robot}"), fit

@@ -26,7 +26,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.cli.commands.predict import reading_options
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
-from diffeo_calib.measurements.csv.writing import write_pose_predictions
+from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.sensors.errors import Evaluation
 
@@ -177,7 +177,7 @@ def test_predicted_poses_are_read_back_as_measurements(convention: str, tmp_path
     turns = rotation_matrices(torch.from_numpy(rng.uniform(-1.5, 1.5, (9, 3))), "rotvec")
     poses, std = transforms(turns, shifts), torch.full((9, 6), 1e-5, dtype=torch.float64)
     path, table = tmp_path / "p.csv", replace(FORMAT, convention=convention, rotation_angle="deg")
-    write_pose_predictions(path, [(q, poses, std)], table, joints=["a", "b"])
+    write_predictions(path, [(q, poses, std)], table, joints=["a", "b"], poses=True)
     header = path.read_text().splitlines()[0].split(";")
     columns = header[header.index("std_z") + 1 : header.index("std_rx")]
     deviations = {"std": ["std_x", "std_y", "std_z"], "rotation_std": ["std_rx", "std_ry", "std_rz"]}

@@ -12,7 +12,7 @@ from trackerless_bank import write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.cli.options import Angle, Length, Rows, Units
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
@@ -84,7 +84,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     ],
 )
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
-    units = Units(length=Length.mm, angle=Angle.deg, sep=";", decimal=",")
+    units = Units(length="mm", angle="deg", sep=";", decimal=",")
     table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
     assert table.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
@@ -133,7 +133,7 @@ def test_readings_that_no_place_explains_are_warned_of(
 def test_several_kinds_are_one_table(tmp_path: Path) -> None:
     """Commands take one kind of reading so far; the table that options describe holds any."""
     (tmp_path / "t.csv").write_text("a,b,x,y,z,C,place,who\n10,20,100,200,300,,,\n20,30,,,,400,,A\n30,40,,,,,s0,\n")
-    csv, units = tmp_path / "t.csv", Units(length=Length.mm, angle=Angle.deg)
+    csv, units = tmp_path / "t.csv", Units(length="mm", angle="deg")
     rows = Rows(position=["x,y,z"], reading=["distance=C"], socket="place")
     arm = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4)] * 2, names=["a", "b"])
     data = measured_table(csv, rows, units).read(arm)

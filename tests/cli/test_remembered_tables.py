@@ -13,11 +13,11 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cli.commands.correct import _reason
-from diffeo_calib.cli.options import Angle, Length, Rows, Units
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import rows_in_table
 from diffeo_calib.sensors.set_ups import MeasuringFrames
 
-UNITS = Units(length=Length.mm, angle=Angle.deg)
+UNITS = Units(length="mm", angle="deg")
 
 
 def of_session(kind: Kind, name: str) -> Any:

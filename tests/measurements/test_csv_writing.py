@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
-from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -206,16 +206,18 @@ def test_predicted_poses_are_written(tmp_path: Path) -> None:
     pose[0, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     q, std = torch.tensor([[0.5]], dtype=torch.float64), torch.full((1, 6), 1e-3, dtype=torch.float64)
     std[:, 3:] = math.radians(0.25)
-    write_pose_predictions(path, [(q, pose, std)], TableFormat("mm", "deg"), joints=["j"])
+    write_predictions(path, [(q, pose, std)], TableFormat("mm", "deg"), joints=["j"], poses=True)
     header, row = path.read_text().splitlines()
     assert header == "j,x,y,z,std_x,std_y,std_z,rx,ry,rz,std_rx,std_ry,std_rz"
     expected = [math.degrees(0.5), 1000, 2000, 3000, 1, 1, 1, 0, 90, 0, 0.25, 0.25, 0.25]
     assert [float(cell) for cell in row.split(",")] == pytest.approx(expected, abs=1e-12)
-    write_pose_predictions(path, [(q, pose, std)], TableFormat("mm", "deg", convention="quat_wxyz"), joints=["j"])
+    write_predictions(
+        path, [(q, pose, std)], TableFormat("mm", "deg", convention="quat_wxyz"), joints=["j"], poses=True
+    )
     assert path.read_text().splitlines()[0] == "j,x,y,z,std_x,std_y,std_z,qw,qx,qy,qz,std_rx,std_ry,std_rz"
     wrong = TableFormat("mm", "deg", convention="euler")
     with pytest.raises(MeasurementError, match=says("`convention`", "got 'euler'")):
-        write_pose_predictions(path, [(q, pose, std)], wrong, joints=["j"])
+        write_predictions(path, [(q, pose, std)], wrong, joints=["j"], poses=True)
 
 
 def test_predicted_markers_are_written(tmp_path: Path) -> None:

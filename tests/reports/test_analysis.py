@@ -177,7 +177,7 @@ def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.F
     torch.testing.assert_close(found.deviation.square(), variance, rtol=1e-4, atol=0)
     low, high = case.train.q.amin(0), case.train.q.amax(0)
     assert bool(((found.q >= low) & (found.q <= high)).all())
-    assert found.measured_rms < found.rms
+    assert found.measured_rms < found.error.workspace
     assert len(found.next) == 5
 
 

@@ -16,10 +16,10 @@ from diffeo_calib.campaign.campaign import Campaign
 from diffeo_calib.campaign.feeds import ID, Listener, Sent, listening, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
-from diffeo_calib.cli.commands.fit import RobotFile
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.live import Live, expected
-from diffeo_calib.cli.live_options import LiveOptions
+from diffeo_calib.cli.models import load_robot
+from diffeo_calib.cli.options import LiveOptions, Robot
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import InputError
@@ -36,18 +36,18 @@ LOOK_SECONDS = 0.1
 Inbox = Queue[Sent | None]
 
 
-def run(links: RobotFile, source: MeasuredTable, given: LiveOptions) -> None:
+def run(links: Robot, source: MeasuredTable, given: LiveOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
     limit = parsed_limit(given.target, "--target")
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--target {given.target}", expected="a length, such as 0.15mm")
-    robot, played = links.read(), _stops(source, given)
+    robot, played = load_robot(links), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
-        live = Live(campaign, source, links.tips, journal, given)
+        live = Live(campaign, source, links.tip, journal, given)
         live.resume()
         inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))

@@ -17,9 +17,9 @@ from diffeo_calib.cli.commands.recalibrate import (
 )
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.options import TableOptions
 from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.plots.joints import comparison
 
@@ -37,10 +37,7 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
     """Compare a model with new measurements."""
     model = load_kinematics(old)
     source = table_of(model, table)
-    for line in provenance_lines(model):
-        say(line)
-    for line in another_date_lines(model):
-        say(line)
+    say(*provenance_lines(model), *another_date_lines(model))
     found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)
     if not isinstance(found, Comparison):
         return
@@ -54,23 +51,18 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
             {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
         ),
     )
-    for line in (
-        () if found.moved is None else motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them"))
-    ):
-        say(line)
+    if found.moved is not None:
+        say(*motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them")))
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
-    told = [str(found), *smallest_lines(found.changes)]
-    for line in change_lines(found.changes) if found.changes.found else told:
-        say(line)
+    say(*(change_lines(found.changes) if found.changes.found else [str(found), *smallest_lines(found.changes)]))
 
 
 def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
     """Compare two models, and draw where they differ."""
     models = [load_kinematics(path) for path in (old, other)]
     for model in models:
-        for line in provenance_lines(model):
-            say(line)
+        say(*provenance_lines(model))
     found = compare(models[0], models[1], seed=seed)
     if not isinstance(found, ModelComparison):
         return

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.options import Correction, Frame, StoredUnits
+from diffeo_calib.cli.options import Correction, StoredUnits
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns
+from diffeo_calib.cli.tables import ProgramTable, joint_columns, table_format
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -31,6 +31,11 @@ from diffeo_calib.robots.tree import Tree
 AXES_OF_A_POSE = 6
 ROWS_AT_ONCE = 100
 """Rows whose deviations are predicted together."""
+REASONS = {
+    "unreachable": "unreachable with corrections within --limit",
+    "singular": "singular: near a singularity it needs a correction larger than --limit",
+}
+"""Statuses in words: the largest correction is part of them."""
 MOST_MISSED = 10
 """Most lines about rows that are not reached."""
 
@@ -71,14 +76,11 @@ class ToolOnTip:
 
 
 def run(model: Path, program: Path, units: StoredUnits, options: Correction, output: Path) -> None:
-    """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit.
-
-    Raises:
-        InputError: options that contradict each other, columns that are missing or taken.
-    """
+    """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     kinematics = load_laden(model, options.payload_mass)
-    source = ProgramTable.of(program, as_fitted(kinematics, None, units)[1], options)
+    stated = as_fitted(kinematics, None, units)[1]
+    source = ProgramTable(program, stated.joints, table_format(stated), options)
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
@@ -93,17 +95,18 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
-    how = {"frame": options.frame.value, "bound": bound, "path": rate is not None, "rate": rate}
+    how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
         progress("commands", 0, 1)
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     allowed = found.q.isfinite().all(1)
-    known = [tool.known(kinematics, found.q[allowed], options.frame.value) for tool in tools if bool(allowed.any())]
+    known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
     sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
-    record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
+    misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
+    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)
-    where = "robot's base" if options.frame.value == "base" else "measuring frame"
+    where = "robot's base" if options.frame == "base" else "measuring frame"
     for tool, each in zip(tools, known, strict=False):
         say(_how_well_known(tool, *each, where))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
@@ -119,17 +122,13 @@ def _check(options: Correction) -> None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:
         check_number(options.rate, "--rate", above=0.0)
-    if options.frame is Frame.measuring and not options.position:
+    if options.frame == "measuring" and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
 def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -> list[ToolOnTip]:
-    """The tools that have targets.
-
-    Raises:
-        InputError: tips that are unknown or repeated, or not one tool for every tip.
-    """
+    """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):
         expected, fix = f"{max(len(tips), 1)} of them", "give one tool for every --tip"
@@ -137,14 +136,14 @@ def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -
     numbers = named.tool or [None] * max(len(tips), 1)
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
-        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from.value, table))]
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from, table))]
     again = [tip for k, tip in enumerate(tips) if tip in tips[:k]]
     if again:
         raise InputError.of(f"--tip {again[0]} is named twice", fix="name every tip once")
     found = []
     for tip, text in zip(tips, numbers, strict=True):
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from.value, table)
+        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
     return found
 
@@ -206,13 +205,9 @@ def _added(
     return added
 
 
-def _misses(found: Compensation, tools: list[ToolOnTip]) -> dict[str, dict[str, Tensor | None]]:
-    """By tip, how far its tool is from each row's target, NaN where it has none, for programs."""
-    angles = None if found.angle_miss is None else found.angle_miss.rad2deg()
-    return {
-        tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": None if angles is None else tool.own(angles)}
-        for tool in tools
-    }
+def _degrees(found: Compensation, tool: ToolOnTip) -> Tensor | None:
+    """Angles (N,) of the tool from its targets, NaN where it has none; None for targets without orientation."""
+    return None if found.angle_miss is None else tool.own(found.angle_miss).rad2deg()
 
 
 def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
@@ -232,14 +227,11 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
             _add_sizes(table, plain(f"{name}, {'deg' if turns else 'mm'}"), sizes)
         out.print(table)
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
-    for line in _missed_lines(found, tools, lines):
-        say(line)
+    say(*_missed_lines(found, tools, lines))
     few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
     if few_joints and 2 * int(found.reached.sum()) < len(found):
-        fix, of_tools = (
-            "name target positions instead (--position)",
-            "" if len(tools) == 1 else f" of {len(tools)} tools",
-        )
+        fix = "name target positions instead (--position)"
+        of_tools = "" if len(tools) == 1 else f" of {len(tools)} tools"
         warn_user(sentence(f"a robot with {robot.n} joints cannot hold every orientation{of_tools}", fix=fix))
     elif 2 * found.counts.get("unreachable", 0) > len(found):
         what = "most targets are farther from their commands than the largest correction allows"
@@ -284,7 +276,8 @@ def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int])
             yield f"  line {lines[row]}: {found.status[row]}, no command is allowed: it starts beyond a joint's limit"
             continue
         misses = ", ".join(filter(None, (_miss(found, tool, row) for tool in tools)))
-        yield f"  line {lines[row]}: {_reason(found, row)}, {misses}"
+        status = str(found.status[row])
+        yield f"  line {lines[row]}: {REASONS.get(status, status)}, {misses}"
     if len(missed) > MOST_MISSED:
         yield f"  and {len(missed) - MOST_MISSED} more; see the column `status`"
 
@@ -294,16 +287,7 @@ def _miss(found: Compensation, tool: ToolOnTip, row: int) -> str:
     distance = float(tool.own(found.miss)[row])
     if isnan(distance):
         return ""
-    angle = "" if found.angle_miss is None else f" and {float(tool.own(found.angle_miss)[row].rad2deg()):.4f} deg"
+    degrees_off = _degrees(found, tool)
+    angle = "" if degrees_off is None else f" and {float(degrees_off[row]):.4f} deg"
     who = "misses" if tool.place is None else f"{tool.tip} misses"
     return f"{who} by {1e3 * distance:.4f} mm{angle}"
-
-
-def _reason(found: Compensation, row: int) -> str:
-    """A status, and what "unreachable" means: the largest correction is part of it."""
-    status = found.status[row]
-    words = {
-        "unreachable": "unreachable with corrections within --limit",
-        "singular": "singular: near a singularity it needs a correction larger than --limit",
-    }
-    return words.get(str(status), str(status))

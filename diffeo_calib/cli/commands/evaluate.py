@@ -19,16 +19,10 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.options import EvaluateOptions
-from diffeo_calib.cli.printed import (
-    ErrorTable,
-    expectation_lines,
-    outlier_lines,
-    registration_lines,
-    socket_lines,
-)
+from diffeo_calib.cli.options import EvaluateOptions, TableOptions
+from diffeo_calib.cli.printed import ErrorTable, expectation_lines, outlier_lines, registration_lines, socket_lines
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import MeasuredTable, TableOptions
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.interop.model_file import save
@@ -60,12 +54,10 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     source = table_of(model, table)
     limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
-    for line in provenance_lines(model):
-        say(line)
+    say(*provenance_lines(model))
     data = source.read(model.robot)
     if options.register:
-        free = "both" if options.free is None else options.free.value
-        return _registered(model, path.name, data, free, options.output)
+        return _registered(model, path.name, data, options.free or "both", options.output)
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
@@ -75,9 +67,13 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
-    _say_places(places)
-    for line in _expectations(model, data, found):
-        say(line)
+    if isinstance(places.frames, MeasuringFrames):
+        record.add(session_transforms=places.frames.entry())
+    if places.numbers:
+        record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
+    say(*map(plain, places.found))
+    say(*(line for errors in found.values() for line in socket_lines(errors, "all rows")))
+    say(*expectation_lines(model, data))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if doubt is not None:
@@ -136,30 +132,12 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
 
 
-def _say_places(places: Places) -> None:
-    """Print and record what was found from the rows."""
-    if isinstance(places.frames, MeasuringFrames):
-        record.add(session_transforms=places.frames.entry())
-    if places.numbers:
-        record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
-    for line in places.found:
-        say(plain(line))
-
-
-def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
-    """Known distances, and the absolute error to expect."""
-    for errors in found.values():
-        yield from socket_lines(errors, "all rows")
-    yield from expectation_lines(model, data)
-
-
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
     """Name rows that look wrong, and warn of likely causes of large errors."""
     judgement = judge(model, places, data, found)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
-    for line in outlier_lines(judgement.outliers, judgement.rows, which):
-        say(line)
+    say(*outlier_lines(judgement.outliers, judgement.rows, which))
     for text in judgement.causes:
         warn_user(text)
 
@@ -167,8 +145,7 @@ def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evalua
 def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     warn_outside_range(model, data.q)
-    for line in another_date_lines(model):
-        say(line)
+    say(*another_date_lines(model))
     found = model.registered(data, free=free, learn=False)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
@@ -184,7 +161,6 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
             table.add(before[kind], f"{after.count} with the places of the fit")
         table.add(after, f"{after.count} with places found anew")
         out.print(table)
-    for line in (*registration_lines(found), *placement_sentences(found)):
-        say(plain(line))
+    say(*map(plain, (*registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")

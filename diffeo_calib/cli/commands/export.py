@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from math import hypot
 from pathlib import Path
 
@@ -39,65 +38,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.known_drift import KnownDrift
 
-PROGRAMS = ("--c", "--torch", "--onnx")
 MEGABYTE = 1e6
-
-
-@dataclass(frozen=True)
-class Tool:
-    """Whose poses programs give.
-
-    Args:
-        transform: (4, 4) tool centre point in the tip's frame, m; None for the model's own.
-        frame: "base" or "measuring"; None for the robot's base.
-    """
-
-    transform: Tensor | None
-    frame: str | None
-
-    @property
-    def named(self) -> bool:
-        """Whether the user asked for a tool or a frame."""
-        return not (self.transform is None and self.frame is None)
-
-
-class Programs:
-    """The programs that are wanted; the C source is made at once, so that nothing is written if it cannot be.
-
-    Args:
-        model: a calibrated robot. wanted: option -> file. tool: whose poses they give.
-        tip: that carries it in C, for a robot with several; None for the model's own.
-    """
-
-    def __init__(
-        self, model: CalibratedKinematics, wanted: Mapping[str, Path], tool: Tool, tip: str | None = None
-    ) -> None:
-        self.model, self.tool, self.frame = model, tool, tool.frame or "base"
-        self.wanted = {option: target for option, target in wanted.items() if option in PROGRAMS}
-        self.c: CFiles | None = None
-        if "--c" in self.wanted:
-            self.c = c_files(model, self.wanted["--c"], tool.transform, self.frame, tip=tip)
-
-    @property
-    def texts(self) -> dict[Path, bytes]:
-        """The C files."""
-        return {} if self.c is None else self.c.contents
-
-    def write(self) -> Iterator[str]:
-        """Write the files that are no texts; yields a sentence about each file."""
-        if self.c is not None:
-            functions = ", ".join(self.c.functions)
-            files = f"{self.c.source} ({self.c.size / MEGABYTE:.1f} MB), {self.c.header.name}"
-            yield f"c: {files}: {functions}, in the frame {self.frame!r}"
-        output = "tool_poses" if self.tool.named else "points"
-        what = f"poses of the tool in the frame {self.frame!r}" if self.tool.named else "markers in the measuring frame"
-        for option, export in (("--torch", export_torch), ("--onnx", export_onnx)):
-            if option in self.wanted:
-                target = self.wanted[option]
-                export(self.model, target, output, tool=self.tool.transform, frame=self.frame)
-                yield f"{option[2:]}: {target} ({target.stat().st_size / MEGABYTE:.1f} MB): {what}"
-
-
 RIGID = ("--urdf", "--mjcf", "--dh", "--ur-kinematics")
 NOMINAL = "nominal robot, registered"
 
@@ -112,7 +53,7 @@ class _Export:
 
     def __init__(self, model: CalibratedKinematics, given: Export) -> None:
         self.model, self.given = model, given
-        self.length, self.angle = given.length.value, given.angle.value
+        self.length, self.angle = given.length, given.angle
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
         self.lines: list[str] = []
@@ -144,7 +85,7 @@ class _Export:
 
     def _text(self, option: str, geometry: Geometry, urdf: bytes | None) -> str:
         if option == "--dh":
-            table = dh_table(geometry, self.given.dh_convention.value, self.given.tip or self.model.tool_tip)
+            table = dh_table(geometry, self.given.dh_convention, self.given.tip or self.model.tool_tip)
             self.lines += _dh_lines(table, self.given)
             return dh_text(table, self.length, self.angle)
         content = urdf or b""
@@ -187,16 +128,13 @@ class _Export:
 
 
 def run(path: Path, given: Export) -> None:
-    """Write the files, then say what each leaves of the model.
-
-    Raises:
-        InputError: the model or the robot's description cannot be used, or a file cannot be written.
-    """
+    """Write the files, then say what each leaves of the model."""
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
     model = load_laden(path, given.payload_mass)
-    units = TableFormat(given.length.value, given.angle.value)
-    own = tool_in_tip(model, given.tool, given.tool_from.value, units)
-    tool = Tool(None if given.tool is None else own, None if given.frame is None else given.frame.value)
+    units = TableFormat(given.length, given.angle)
+    own = tool_in_tip(model, given.tool, given.tool_from, units)
+    tool = None if given.tool is None else own
+    source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)
     export = _Export(model, given)
     tables = "--correction-tables" in wanted
     if rigid := [option for option in wanted if option in RIGID]:
@@ -205,33 +143,48 @@ def run(path: Path, given: Export) -> None:
         export.offsets()
     if tables:
         export.tables()
-    programs = Programs(export.model, wanted, tool, given.tip)
     camera = export.camera(wanted["--camera"]) if "--camera" in wanted else {}
-    write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts | camera)
+    texts = {} if source is None else source.contents
+    write_together({wanted[option]: content for option, content in export.files.items()} | texts | camera)
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
-    for line in (*export.lines, *_open_lines(export.model, rigid), *_drift_lines(model)):
-        say(line)
+    say(*export.lines, *_limits(model, rigid))
     for option in export.files:
         say(f"{option[2:]}: {wanted[option]}")
-    for line in programs.write():
+    for line in _write_programs(model, given, tool, source):
         say(line)
 
 
-def _open_lines(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
-    """Directions that the rows leave open, for rigid kinematics: their base and tool are right only together."""
+def _write_programs(
+    model: CalibratedKinematics, given: Export, tool: Tensor | None, source: CFiles | None
+) -> Iterator[str]:
+    """Write the programs that are no texts; yields a sentence about each program.
+
+    Args:
+        tool: (4, 4) tool centre point in the tip's frame, m; None for the model's own. source: what was written in C.
+    """
+    frame, named = given.frame or "base", not (tool is None and given.frame is None)
+    if source is not None:
+        files = f"{source.source} ({source.size / MEGABYTE:.1f} MB), {source.header.name}"
+        yield f"c: {files}: {', '.join(source.functions)}, in the frame {frame!r}"
+    output = "tool_poses" if named else "points"
+    what = f"poses of the tool in the frame {frame!r}" if named else "markers in the measuring frame"
+    for name, target, export in (("torch", given.torch, export_torch), ("onnx", given.onnx, export_onnx)):
+        if target is not None:
+            export(model, target, output, tool=tool, frame=frame)
+            yield f"{name}: {target} ({target.stat().st_size / MEGABYTE:.1f} MB): {what}"
+
+
+def _limits(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
+    """Directions that the rows leave open: base and tool of rigid kinematics are right only together. And a drift."""
     if rigid and (places := ExpectedError.of(model).open_places):
         yield (
             f"the rows of the fit leave {' and '.join(places)} open: base and tool of these files may both stand apart "
             "from the model's along it; use them together, at poses like those of the fit"
         )
-
-
-def _drift_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """How a drift enters files that know neither time nor temperature."""
     drift = KnownDrift.of(model)
-    if drift is not None:
+    if drift is not None:  # which the files do not know
         yield from drift.sentences()
         yield f"no file knows the {' or the '.join(drift.names)}: they hold at {drift.holds()}"
 
@@ -264,17 +217,12 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
 def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
-        yield f"DH {name} (x y z, roll pitch yaw): {_place(transform, given)}"
+        numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)
+        words = [f"{' '.join(f'{value:.6g}' for value in in_unit(own, unit))} {unit}" for own, unit in numbers]
+        yield f"DH {name} (x y z, roll pitch yaw): {', '.join(words)}"
     parallel = [name for name, row in zip(table.names, table.rows, strict=True) if row.beta]
     if parallel:
         yield f"DH rows with Hayati's beta, next to parallel axes: {', '.join(parallel)}"
-
-
-def _place(transform: Tensor, given: Export) -> str:
-    xyz, rpy = origin_numbers(transform)
-    place = " ".join(f"{value:.6g}" for value in in_unit(xyz, given.length.value))
-    turn = " ".join(f"{value:.6g}" for value in in_unit(rpy, given.angle.value))
-    return f"{place} {given.length.value}, {turn} {given.angle.value}"
 
 
 def _table_lines(tables: list[CorrectionTable]) -> Iterator[str]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
-from diffeo_calib.cli.models import load_kinematics, made_by_command
+from diffeo_calib.cli.models import load_kinematics, load_robot, made_by_command
+from diffeo_calib.cli.options import FitOptions, Robot
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -35,8 +36,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
-from diffeo_calib.robots.tree import Tree
-from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
 
@@ -48,73 +47,34 @@ Errors = dict[str, KindErrors]
 """Errors of every stage by the kind of rows."""
 
 
-@dataclass(frozen=True)
-class RobotFile:
-    """A robot in a URDF.
-
-    Args:
-        urdf: the file. base: its first link.
-        tips: the last link, or that of every marker. loads: links of other branches whose weight bends the robot.
-    """
-
-    urdf: Path
-    base: str
-    tips: Sequence[str]
-    loads: Sequence[str] = ()
-
-    def read(self) -> Tree:
-        """Read the file."""
-        return load_urdf(self.urdf, self.base, list(dict.fromkeys(self.tips)), self.loads)
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Files to write: the model, a figure of its errors and a report, if they are wanted."""
-
-    model: Path
-    figure: Path | None = None
-    report: Path | None = None
-
-
-def run(
-    robot: RobotFile,
-    source: MeasuredTable,
-    outputs: Outputs,
-    *,
-    holdout: float,
-    seed: int,
-    controls: int | None,
-    note: str = "",
-    scales_of: Sequence[Path] = (),
-) -> None:
+def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
-        chain, others = robot.read(), [load_kinematics(path) for path in scales_of]
-        data = source.read(chain, robot.tips)
-        train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-        how = {"controls": controls or "auto", "seed": seed, "note": note, "scales_of": others}
+        chain, others = load_robot(robot), [load_kinematics(path) for path in given.scales_of or ()]
+        data = source.read(chain, robot.tip)
+        train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
+        how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
-    hand_eye = hand_eye_of(result)
-    save(result.model, outputs.model)  # before anything is printed: output may be cut off
+    own = result.placed.coordinates
+    on_tool = None if own is None else own.table.sees_board_from_tool  # of a camera that measured the rows
+    hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
+    save(result.model, output)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**hand_eye_entry(hand_eye))
-    _record(result, in_train, held_out, vars(outputs))
-    for line in _verdict(result, held_out or {}):
-        say(line)
+    _record(result, in_train, held_out, {"model": output, "figure": given.figure, "report": given.report})
+    say(*_verdict(result, held_out or {}))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
     wrong = [] if held_out is None else _contradicted(result.model, held_out)
-    for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
-        say(line)
-    for line in _lines_about_places(result, data, held_out, hand_eye):
-        say(line)
+    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+    say(*_lines_about_places(result, data, held_out, hand_eye))
     for one in (held_out or {}).values():
         if one.one.what == ERRORS:
             _show_verdict(one.stages[GEOMETRIC], one.stages[CALIBRATED], wrong=bool(wrong))
-    say(f"model: {outputs.model}")
+    say(f"model: {output}")
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
-    _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
+    _write_pictures(result, given, source.csv.name, held_out or in_train, **shown)
     _end(result, in_train, held_out or in_train)
 
 
@@ -139,13 +99,6 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
             check_errors(result.model, one.one, in_train[kind].stages[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
-
-
-def hand_eye_of(result: CalibrationResult) -> dict[str, HandEye]:
-    """Cameras and board by the names of the cameras; none if no camera is known to have measured the rows."""
-    own = result.placed.coordinates
-    on_tool = None if own is None else own.table.sees_board_from_tool
-    return {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
 
 
 def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
@@ -183,25 +136,25 @@ def _lines_about_places(
 
 
 def _write_pictures(
-    result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, *, rows: str, data: Any
+    result: CalibrationResult, given: FitOptions, name: str, errors: Errors, *, rows: str, data: Any
 ) -> None:
     """Draw the figure and write the report, if they are wanted.
 
     Args:
         name: of the table. errors: of each stage on the rows to show. rows: what these are. data: these rows.
     """
-    if outputs.figure is not None:
+    if given.figure is not None:
         shown = f"{sum(len(one.rows) for one in errors.values())} {rows} rows"
         shown += ", no row was held out" * (rows == "training")
         panels = [one.stages for one in errors.values()]
-        write_figure(stages(panels, f"{printable(name)}: errors on {shown}"), outputs.figure)
-        say(f"figure: {outputs.figure}")
-    if outputs.report is not None:
+        write_figure(stages(panels, f"{printable(name)}: errors on {shown}"), given.figure)
+        say(f"figure: {given.figure}")
+    if given.report is not None:
         with progress_bar() as progress:
             placed = {stage: result.places(stage) for stage in result.stages}
             how = {"stages": result.stages, "places": placed, "warnings": record.warnings}
-            write_report(result.model, outputs.report, data, **how, progress=progress)
-        say(f"report: {outputs.report} (open it in a browser)")
+            write_report(result.model, given.report, data, **how, progress=progress)
+        say(f"report: {given.report} (open it in a browser)")
 
 
 def _record(
@@ -265,20 +218,13 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         out.print(parts_table(result.parts))
     for wave in result.gear_lines:
         say(wave.sentence)
-    for line in outlier_lines(result.outliers, rows):
-        say(line)
+    say(*outlier_lines(result.outliers, rows))
     say(result.status)
     if detailed:
-        for line in _solver_lines(result):
-            say(line)
-
-
-def _solver_lines(result: CalibrationResult) -> Iterator[str]:
-    """How many parameters the fit has, and how well it solves its equations."""
-    left_out, fitted = result.leave_one_out, result.fit
-    if left_out.effective is not None:
-        yield f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates"
-    yield (
-        f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
-        f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
-    )
+        left_out, fitted = result.leave_one_out, result.fit
+        if left_out.effective is not None:
+            say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
+        say(
+            f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
+            f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
+        )

@@ -22,7 +22,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 
 def run(folders: Sequence[Path], joints: Path, given: BoardImages, output: Path) -> None:
     """Find the board, and write corners, cameras and overview."""
-    table = TableFormat(given.length.value, "rad", given.sep, given.decimal)
+    table = TableFormat(given.length, "rad", given.sep, given.decimal)
     with progress_bar() as progress:
         found = read_folders(folders, joints, Board.of(given.board), table.sep, progress)
     text, several = io.StringIO(newline=""), len(found) > 1

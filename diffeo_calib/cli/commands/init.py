@@ -57,8 +57,7 @@ def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
         fix = "name another file by -o, or add --force to replace it"
         raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
     write_whole(output, content)
-    for line in lines:
-        say(line)
+    say(*lines)
     fill_in = ", fill in the lines that say `uncomment`" * any("uncomment" in line for line in lines)
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
 

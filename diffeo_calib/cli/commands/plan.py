@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from math import isfinite, pi, radians
 from pathlib import Path
@@ -85,28 +85,21 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
             target=configurations(given.target_poses),
             marker=None if framed else markers,
             measured=configurations(given.measured),
-            free=None if given.free is None else given.free.value,
+            free=given.free,
             sensor=sensors,
         )
     found.write(output, table, names)
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
-    for line in _lines_of_fit(source):
-        say(line)
+    if isinstance(source, CalibratedKinematics):
+        say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
+        say(*expectation_lines(source, None))
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:
         say("its column `device`: what measures the pose")
-        for line in [line for one in sensors for line in one.sentences()]:
-            say(line)
-
-
-def _lines_of_fit(source: Tree | CalibratedKinematics) -> Iterator[str]:
-    """Expected error over the joint ranges of the fit, and why that of the plan differs."""
-    if isinstance(source, CalibratedKinematics):
-        yield "the table averages over the poses that were drawn or given; they may lie beyond those of the fit"
-        yield from expectation_lines(source, None)
+        say(*(line for one in sensors for line in one.sentences()))
 
 
 def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:
@@ -190,9 +183,11 @@ def _drawn(
 ) -> Tensor:
     """Random configurations, shared by sensors that need the ball in their sockets and those that do not."""
     cell, table = how
-    robot, base = _robot_and_base(given)
+    if isinstance(given, CalibratedKinematics):
+        robot, base, wheres = given.robot, given.geometry.base, [one.where(given) for one in sensors]
+    else:
+        robot, base, wheres = given, torch.eye(4, dtype=torch.float64, device=HOST), []
     held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
-    wheres = [one.where(given) for one in sensors] if isinstance(given, CalibratedKinematics) else []
     seen, found = [where for where in wheres if where is not None], []
     each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
         (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
@@ -204,13 +199,6 @@ def _drawn(
             share = -(-count * number // len(sensors))
             found.append(_random(cell, robot, marker, share, places=places, table=table, where=where))
     return torch.cat(found)
-
-
-def _robot_and_base(given: Tree | CalibratedKinematics) -> tuple[Tree, Tensor]:
-    """A robot and its base (4, 4) in the measuring frame, m; the identity where it is not known."""
-    if isinstance(given, CalibratedKinematics):
-        return given.robot, given.geometry.base
-    return given, torch.eye(4, dtype=torch.float64, device=HOST)
 
 
 MOVED = {"base": "the measuring device is", "marker": "the markers are", "both": "device and markers are"}
@@ -248,11 +236,7 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
 
 
 def _numbers(option: str, text: str, counts: tuple[int, ...]) -> list[float]:
-    """Numbers separated by commas.
-
-    Raises:
-        InputError: another number of numbers.
-    """
+    """Numbers separated by commas."""
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import Progress, progress_bar, say
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Rows, TableOptions
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, with_rows
+from diffeo_calib.cli.tables import joint_columns, table_format, with_rows
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -24,12 +23,11 @@ from diffeo_calib.kinematics.joint_ranges import OutsideRange
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
-from diffeo_calib.measurements.csv.writing import Predictions, write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
-Block = TypeVar("Block", bound=Sized)
-PERCENT = 100
-CHECKING = "checking, %"
+Laden = tuple[Tensor, Tensor | None]
+"""Joint values (B, n) and payloads (B,) of some rows."""
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
     "rigid motion of all of them; `evaluate --register` with measured positions finds it"
@@ -39,18 +37,18 @@ OWN_FRAME = (
 def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> None:
     """Find all mistakes in a table, and warn of rows outside the joint ranges of the fit."""
     outside = OutsideRange(model)
-    file.check(lambda values: outside.add(values.q), lambda part: progress(CHECKING, int(PERCENT * part), PERCENT))
+    file.check(lambda values: outside.add(values.q), lambda part: progress("checking, %", int(100 * part), 100))
     outside.refuse_other_unit()
     outside.warn()
 
 
-def counted(blocks: Iterable[Block], rows: int, progress: Progress) -> Iterator[Block]:
+def counted(blocks: Iterable[Laden], rows: int, progress: Progress) -> Iterator[Laden]:
     """The same blocks of rows; the bar moves when each has been used."""
     done = 0
     progress("rows", done, rows)
     for block in blocks:
         yield block
-        done += len(block)
+        done += len(block[0])
         progress("rows", done, rows)
 
 
@@ -58,13 +56,9 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     A payload that is a number is the mass of all rows.
-
-    Raises:
-        InputError: options of a rotation for a model that was calibrated with points.
     """
     kinematics = load_kinematics(model)
-    for line in provenance_lines(kinematics):
-        say(line)
+    say(*provenance_lines(kinematics))
     table, joints = _written_as_read(kinematics, given)
     robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
@@ -78,19 +72,18 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
         check_payload_column(kinematics, table.payload)
     prefixes = kinematics.bodies.prefixes(kinematics)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
-    write = write_pose_predictions if with_poses else write_predictions
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
-        laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = (_predicted(readings, rows.carried_by(kinematics), rows.q) for rows in laden)
-        write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes, more=readings.names)
+        laden = counted(file.laden_joints(), file.rows, progress)
+        blocks = (_predicted(readings, kinematics, *rows) for rows in laden)
+        how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
+        write_predictions(output, blocks, table, joints=names, **how)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if kinematics.own_frame:
         say(OWN_FRAME)
-    for line in readings.sentences():
-        say(line)
+    say(*readings.sentences())
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
@@ -105,21 +98,6 @@ def _written_as_read(model: CalibratedKinematics, given: TableOptions) -> tuple[
     return with_rows(table_format(stated), rows), stated.joints
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Joint values (B, n), rad or m, and payloads (B,) if they are known."""
-
-    q: Tensor
-    masses: Tensor | None
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics:
-        """The model under the payloads of the rows."""
-        return model if self.masses is None else model.at_payloads(self.masses)
-
-
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
     options = []
@@ -131,8 +109,13 @@ def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     return f"{' '.join(options)} --convention {written.convention}{unit}"
 
 
-def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor) -> Predictions:
-    """Joint values, means and standard deviations of markers or poses, and cells of the devices' readings."""
+def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, masses: Tensor | None) -> Predictions:
+    """Joint values, means and standard deviations of markers or poses, and cells of the devices' readings.
+
+    Args:
+        q: (B, n) rad or m. masses: (B,) payloads, if they are known.
+    """
+    model = model if masses is None else model.at_payloads(masses)
     mean, covariance = model.bodies.written(model, q)
     return q, mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt(), readings.cells(model, q)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -15,37 +15,23 @@ from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, re
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
+from diffeo_calib.cli.options import TableOptions
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-@dataclass(frozen=True)
-class Options:
-    """Assumptions about the set-up, and the note that is kept with the model."""
-
-    marker: str
-    drift: str
-    seed: int
-    note: str
-
-
-def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
+def run(old: Path, table: TableOptions, output: Path, **how: Any) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model = load_kinematics(old)
     source = table_of(model, table)
-    for line in provenance_lines(model):
-        say(line)
-    for line in another_date_lines(model):
-        say(line)
+    say(*provenance_lines(model), *another_date_lines(model))
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)
         warn_outside_range(model, data.q)
-        named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
-        result = recalibrate(model, data, progress=progress, **named)
+        result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
         changes=changes_entry(result.changes),
@@ -66,8 +52,7 @@ def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     )
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     frame = () if result.moved is None else frame_lines(result.moved)
-    for line in (*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden)):
-        say(line)
+    say(*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden))
     say(result.fit.status)
     say(f"model: {output}")
     if not result.fit.converged:

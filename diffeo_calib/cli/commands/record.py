@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
-from typing import Any
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.record import record
@@ -13,6 +10,7 @@ from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
 from diffeo_calib.measurements.csv.images import IMAGE
+from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 
 
@@ -22,7 +20,7 @@ def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, of
     if seen.values.shape[1]:
         found, offset = stops(joints, seen, limits, offset)
         table = rows_of(names, found)
-        write_whole(output, _text(table))
+        write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)], ",", "\n"))
         say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {topics[1]}")
         rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
         say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
@@ -34,17 +32,8 @@ def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, of
             files[time] = f"{times.index(time):05d}{suffix}"
             write_whole(output.parent / files[time], content)
         rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]
-        write_whole(output, _text(rows))
+        write_whole(output, csv_text([list(rows[0]), *(row.values() for row in rows)], ",", "\n"))
         left = f"; {without} stops without an image were left out" * bool(without)
         say(f"{len(found)} images of stops written beside {shown(output)}{left}")
         say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")
     record.add(rows=len(found), clock_offset_s=offset, files={"table": output})
-
-
-def _text(rows: list[dict[str, Any]]) -> bytes:
-    """Rows as CSV."""
-    text = io.StringIO(newline="")
-    sheet = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    sheet.writeheader()
-    sheet.writerows(rows)
-    return text.getvalue().encode()

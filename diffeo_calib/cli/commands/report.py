@@ -8,9 +8,8 @@ from typing import Any
 from diffeo_calib.cli.commands.acceptance import parsed_limit
 from diffeo_calib.cli.console import exit_on_interrupt, plain, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
-from diffeo_calib.cli.options import Page
+from diffeo_calib.cli.options import Page, TableOptions
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
-from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.analysis.findings import Findings, unseen
 from diffeo_calib.reports.html import kinds, sentences
@@ -31,8 +30,7 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
     given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, output, data, **given, progress=progress)
-    for line in provenance_lines(kinematics):
-        say(line)
+    say(*provenance_lines(kinematics))
     words: Any = sentences if isinstance(found, Findings) else kinds
     if isinstance(found, Findings):
         left_out, coverage = found.predictions.left_out, found.predictions.coverage()

@@ -11,17 +11,10 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
-from diffeo_calib.measurements.checks import (
-    unlikely_joint_units,
-    unlikely_position_units,
-    unlikely_rotation_units,
-    unlikely_slide_units,
-)
+from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
-
-MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
 
 
 @runtime_checkable
@@ -184,12 +177,13 @@ class Columns:
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         q, points, rotations, *_ = self._parts(raw)
-        largest_angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
-        sentences = unlikely_joint_units(largest_angle, self.table.angle, kinds_known=known)
-        sentences += unlikely_slide_units(_largest(q[:, self.prismatic]), self.table.joint_unit)
-        sentences += unlikely_position_units(_largest(points), self.table.length)
+        angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
+        sentences = unlikely_units("angles", angle, self.table.angle, "angle", kinds_known=known)
+        slides = _largest(q[:, self.prismatic])
+        sentences += unlikely_units("prismatic joints", slides, self.table.joint_unit, "joint_length")
+        sentences += unlikely_units("positions", _largest(points), self.table.length, "length")
         if self.rotation and len(self.rotation) == 3 * len(self.triples):
-            sentences += unlikely_rotation_units(_largest(rotations), self.rotation_unit)
+            sentences += unlikely_units("rotations", _largest(rotations), self.rotation_unit, "rotation_angle")
         return sentences
 
     def _parts(self, raw: Tensor) -> tuple[Tensor, ...]:
@@ -251,7 +245,7 @@ def _joint_columns(
         fix = "name a column for every joint of the robot, in its order"
         raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
     for kind in kinds:
-        check_choice("kinds", kind, MOVING_KINDS)
+        check_choice("kinds", kind, [known for known in KINDS if known != "fixed"])
     prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
     return tuple(name.strip() for name in joints), prismatic, known
 
@@ -260,8 +254,7 @@ def _std_names(std: Names | None, markers: int) -> tuple[str, ...]:
     """One, ``markers`` or 3 x ``markers`` names, given flat or as one triple per marker."""
     if std is None:
         return ()
-    nested = not isinstance(std, str) and len(std) > 0 and not any(isinstance(name, str) for name in std)
-    names = [name for group in std for name in group] if nested else std
+    names = std if isinstance(std, str) else flat_names(std) or std
     expected = "names of columns: one, one per marker or three per marker"
     return column_names("std", names, expected, (1, markers, 3 * markers))
 

@@ -60,7 +60,10 @@ def read_observations(
     with TableFile(file, numbers) as whole:
         values, lines = whole.read()
     rows = FileRows(TextCells(file, table.sep), numbers, values, lines, alone=len(sensors) == 1)
-    tables = [_laden(sensor, own) for sensor, own in _divided(rows, sensors)]
+    tables = []
+    for sensor, here in _divided(rows, sensors):
+        own = sensor.own_lines(here)
+        tables.append(own.values.beside(sensor.table(here)).with_line_numbers(own.lines))
     data = tables[0] if rows.alone else joined_tables(tables)
     data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
     sha256 = file_sha256(file)
@@ -83,12 +86,6 @@ def numeric_columns(columns: TableColumns, table: TableFormat) -> Columns:
     triples = position_triples(columns.position)
     found = Columns.of(table.for_reading(), columns.joints, columns.kinds, triples)
     return replace(found, all_hidden=len(columns.sensors) > 1)
-
-
-def _laden(sensor: SensorColumns, rows: FileRows) -> Any:
-    """The rows of one kind, with their lines, payloads and covariates."""
-    own = sensor.own_lines(rows)
-    return own.values.beside(sensor.table(rows)).with_line_numbers(own.lines)
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
@@ -141,7 +138,6 @@ def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: 
 
 __all__ = [
     "open_joints",
-    "open_measurements",
     "read_joints",
     "read_measurements",
     "read_observations",
@@ -149,8 +145,6 @@ __all__ = [
     "read_table",
     "write_measurements",
 ]
-PLAIN = (1.0, 1.0, 0.0, 0.0)
-"""Intrinsics of what is no image."""
 
 
 @outside_inference_mode
@@ -337,7 +331,7 @@ def read_readings(
         raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
     given = [std] if isinstance(std, str) else std
     known = () if given is None else column_names("std", given, "names of columns", several)
-    of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or PLAIN, known, on)
+    of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or (1.0, 1.0, 0.0, 0.0), known, on)
     table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
     return _read(path, TableColumns(robot, readings=(of_kind,), kinds=kinds), table, duplicates, joints)
 
@@ -370,15 +364,3 @@ def open_joints(
 ) -> TableFile:
     """The same file as :func:`read_joints` reads, to be read in blocks."""
     return TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
-
-
-def open_measurements(
-    path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
-    position: Names,
-    table: TableFormat,
-    *,
-    kinds: Sequence[str] | None = None,
-) -> TableFile:
-    """The same file as :func:`read_table` reads, to be read in blocks; exact repeats of rows are kept."""
-    return TableFile(Path(path), Columns.of(table.for_reading(), joints, kinds, position_triples(position)))

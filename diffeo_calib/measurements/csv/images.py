@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,9 +108,3 @@ def corner_lines(data: Any, cells: Mapping[str, list[Any]], per_metre: float) ->
     found |= {name: [column[k] for k in whose] for name, column in {**cells, **named}.items()}
     corners = torch.cat([per_metre * points[:, :2], points[:, 3:]], 1)
     return found | dict(zip((*POINT, *PIXEL), corners.T.tolist(), strict=True)), number
-
-
-def image_size(words: Sequence[str]) -> tuple[int, int] | None:
-    """Width and height as written in an option; None for anything else."""
-    whole = [int(word) for word in words if word.isdecimal()]
-    return (whole[0], whole[1]) if len(words) == len(whole) == 2 and min(whole) > 0 else None

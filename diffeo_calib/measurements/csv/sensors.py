@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
-from diffeo_calib.measurements.checks import unlikely_position_units
+from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import BadCells, TextCells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.tables import to_measurements
@@ -22,9 +22,7 @@ from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
 
-WITHOUT_SOCKET = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
-DEVICE = "the name of the device of this reading"
 
 
 class FileRows(NamedTuple):
@@ -139,7 +137,8 @@ class SocketColumns(OneLineEach):
         if not self.names:
             fix = "pass ['place', 'socket']"
             raise MeasurementError.of("`socket`", expected="names of columns", got="none", fix=fix)
-        said = {"expected": "the name of a place or socket", "fix": WITHOUT_SOCKET, "empty": not rows.alone}
+        fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
+        said = {"expected": "the name of a place or socket", "fix": fix, "empty": not rows.alone}
         cells = list(zip(*(rows.cells.texts(name, rows.lines, **said) for name in self.names), strict=True))
         _check_whole(rows, self.names, [[bool(text) for text in row] for row in cells], "a name")
         return [SEPARATOR.join(row) if all(row) else "" for row in cells]
@@ -195,16 +194,18 @@ class ReadingColumns(OneLineEach):
         table, shape = rows.columns.table, (len(rows.lines), 1)
         if isinstance(self.values, tuple):
             seen = self._read(rows, self.values)
-            self._check_positive(rows, self.values, seen)
+            if self.kind == "distance" and not self.offset_std:
+                fix = "repair or remove these lines; distances with an unknown zero are displacements"
+                _check_positive(rows, self.values, seen, "a distance above 0", fix)
         else:
             seen = torch.full(shape, self.values, dtype=torch.float64, device=HOST)
         std = self._read(rows, self.std) if self.std else None
         if std is not None:
             _check_positive(rows, self.std, std, "a positive standard deviation", "repair these lines")
         if self.kind == "distance":
-            for text in unlikely_position_units(float(seen.abs().max()), table.length):
+            for text in unlikely_units("positions", float(seen.abs().max()), table.length, "length"):
                 warn_user(f"file '{rows.cells.path}': {text}".replace("positions", "distances"))
-        devices = rows.names(self.device, DEVICE, ONE_READING)
+        devices = rows.names(self.device, "the name of the device of this reading", ONE_READING)
         data = self._readings(rows, table, devices, seen, std)
         return data.with_tips(None if self.on is None else [self.on])
 
@@ -233,11 +234,6 @@ class ReadingColumns(OneLineEach):
         return torch.stack(
             [rows.cells.numbers(name, rows.lines, decimal, ONE_READING, empty=empty) for name in names], 1
         )
-
-    def _check_positive(self, rows: FileRows, names: Sequence[str], seen: Tensor) -> None:
-        if self.kind == "distance" and not self.offset_std:
-            fix = "repair or remove these lines; distances with an unknown zero are displacements"
-            _check_positive(rows, names, seen, "a distance above 0", fix)
 
 
 @dataclass(frozen=True)

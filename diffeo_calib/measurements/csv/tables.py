@@ -98,8 +98,8 @@ Progress = Callable[[float], object]
 class TableFile:
     """A CSV file with columns in known units, used as a context.
 
-    It can be read as a whole (:meth:`read`), or in two passes for tables that do not fit in memory: :meth:`check`
-    finds all mistakes and the number of rows; then :meth:`blocks` and :meth:`measurements` return the rows.
+    It can be read as a whole (:meth:`read`), or in two passes for joint values that do not fit in memory: :meth:`check`
+    finds all mistakes and the number of rows; then :meth:`laden_joints` returns the rows.
 
     Args:
         path: the file.
@@ -135,34 +135,23 @@ class TableFile:
         return self.columns.to_si(torch.cat([raw for raw, _ in blocks])), numbers
 
     def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
-        """Find all mistakes, count the rows, and show every block to ``each``; errors and warnings as in :meth:`read`.
-
-        Raises:
-            MeasurementError: also numbers that do not form a rotation.
-        """
-        for raw, lines in self._checked():
-            values = self.columns.to_si(raw)
-            if self.columns.rotation:
-                to_measurements(self.path, values, lines, self.columns)
+        """Find all mistakes, count the rows, and show blocks to ``each``; errors and warnings as in :meth:`read`."""
+        for raw, _ in self._checked():
             if each is not None:
-                each(values)
+                each(self.columns.to_si(raw))
             if progress is not None:
                 progress(self._file.progress)
 
-    def joints(self) -> Iterator[Tensor]:
-        """Joint values (B, n) [rad or m] of every block, after :meth:`check`."""
-        return (q for q, _ in self.laden_joints())
-
     def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """Joint values of every block, and payloads (B,) if they have a column, after :meth:`check`."""
-        found = (self.columns.to_si(raw) for raw, _ in self._again())
-        return ((values.q, values.payload) for values in found)
-
-    def measurements(self) -> Iterator[Measurements]:
-        """The measurements of every block, after :meth:`check`."""
-        for raw, lines in self._again():
+        """Joint values (B, n) [rad or m] of every block, and payloads (B,) if there are some, after :meth:`check`."""
+        count = 0
+        for raw, _ in self._numbers():
+            count += len(raw)
             values = self.columns.to_si(raw)
-            yield to_measurements(self.path, values, lines, self.columns).with_line_numbers(lines)
+            yield values.q, values.payload
+        if count != self.rows:
+            what, fix = f"file '{self.path}' changed while it was read", "run the command again"
+            raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
         columns = self.columns
@@ -190,16 +179,6 @@ class TableFile:
             body = "frame" if self.columns.rotation else "marker"
             what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", f"leave this {body} out"
             raise MeasurementError.of(what, expected=f"some line that shows this {body}", fix=fix)
-
-    def _again(self) -> Iterator[Block]:
-        """The blocks of a further pass."""
-        count = 0
-        for raw, lines in self._numbers():
-            count += len(lines)
-            yield raw, lines
-        if count != self.rows:
-            what, fix = f"file '{self.path}' changed while it was read", "run the command again"
-            raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
 
 def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns) -> Measurements:

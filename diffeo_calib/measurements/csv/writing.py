@@ -42,82 +42,48 @@ def write_predictions(
     kinds: Sequence[str] | None = None,
     prefixes: Sequence[str] = ("",),
     more: Sequence[str] = (),
+    poses: bool = False,
 ) -> None:
-    """Write configurations, predicted markers and their standard deviations; overwrites.
+    """Write configurations, predicted markers or poses and their standard deviations; overwrites.
 
-    Columns: the joints, then x, y, z, std_x, std_y, std_z for each marker; of several markers with prefixes; then more.
+    Columns: the joints, then for each marker or frame x, y, z, std_x, std_y, std_z and, of a pose, the columns of the
+    rotation, and std_rx, std_ry, std_rz; of several with prefixes; then more.
 
     Args:
         path: the file; it appears when the last block is written.
-        blocks: configurations (B, n), rad and m, markers (B, P, 3), m, their standard deviations (B, P, 3), m, and more
-            cells (B, k) as they are written.
-        table: units, separator and decimal mark.
+        blocks: configurations (B, n), rad and m; markers (B, P, 3), m, or poses (B, 4, 4) or (B, T, 4, 4), m; standard
+            deviations (B, P, 3), m, or (B, 6) or (B, T, 6): of positions, m, and of rotations about the measuring
+            frame's axes, rad; and more cells (B, k) as they are written.
+        table: the format, of poses with defaults as in :func:`write_measurements`.
         joints: names of the joint columns.
         kinds: kind of every joint; all revolute by default.
-        prefixes: what the names of the columns of each marker begin with. more: k names of further columns.
-
-    Raises:
-        InputError: a file that cannot be written.
-    """
-    columns = Columns.of(table.joints_only(), joints, kinds, [])
-    names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-
-    def rows(q: Tensor, points: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
-        lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
-        return torch.cat([columns.joints_from_si(q), lengths, *others], dim=1)
-
-    write_rows(path, [*columns.joints, *names, *more], (rows(*block) for block in blocks), table)
-
-
-def write_pose_predictions(
-    path: str | PathLike[str],
-    blocks: Iterable[Predictions],
-    table: TableFormat,
-    *,
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
-    prefixes: Sequence[str] = ("",),
-    more: Sequence[str] = (),
-) -> None:
-    """Write configurations, predicted poses and their standard deviations; overwrites.
-
-    Columns: the joints, then for each frame x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx,
-    std_ry, std_rz; of several frames with prefixes.
-
-    Args:
-        path: the file; it appears when the last block is written.
-        blocks: configurations (B, n), rad and m, poses (B, 4, 4) or (B, T, 4, 4), m, and standard deviations (B, 6) or
-            (B, T, 6): of positions, m, and of rotations about the measuring frame's axes, rad; and more cells (B, k).
-        table: the format, with defaults as in :func:`write_measurements`.
-        joints: names of the joint columns.
-        kinds: kind of every joint; all revolute by default.
-        prefixes: what the names of the columns of each frame begin with. more: k names of further columns.
+        prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
+        poses: whether the blocks hold poses.
 
     Raises:
         MeasurementError: unknown unit or convention.
         InputError: a file that cannot be written.
     """
-    table = table.for_writing(rotation_std=True, prefixes=prefixes)
-    columns = Columns.of(table.joints_only(), joints, kinds, [])
-    turns, deviations = (_per_frame(flat_names(names), len(prefixes)) for names in (table.rotation, table.rotation_std))
-    lengths = ("x", "y", "z", "std_x", "std_y", "std_z")
-    names = list(columns.joints)
-    for prefix, turn, deviation in zip(prefixes, turns, deviations, strict=True):
-        names += [*(f"{prefix}{name}" for name in lengths), *turn, *deviation]
+    columns, count = Columns.of(table.joints_only(), joints, kinds, []), len(prefixes)
+    names, turned = list(columns.joints), [()] * count
+    if poses:
+        table = table.for_writing(rotation_std=True, prefixes=prefixes)
+        turns, deviations = (flat_names(own) for own in (table.rotation, table.rotation_std))
+        each = len(turns) // count
+        turned = [turns[each * k : each * (k + 1)] + deviations[3 * k : 3 * (k + 1)] for k in range(count)]
+    for prefix, own in zip(prefixes, turned, strict=True):
+        names += [*(f"{prefix}{std}{axis}" for std in ("", "std_") for axis in "xyz"), *own]
 
-    def rows(q: Tensor, poses: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
-        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), -1, 6)
-        for pose, own in zip(by_frame(poses).unbind(1), spreads.unbind(1), strict=True):
-            parts.append(columns.lengths_from_si(torch.cat([pose[:, :3, 3], own[:, :3]], dim=1)))
-            parts += rotation_parts(pose[:, None], own[:, 3:], table)
+    def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
+        frames = by_frame(mean) if poses else None
+        places = mean if frames is None else frames[..., :3, 3]
+        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), count, -1)
+        for k in range(count):
+            parts.append(columns.lengths_from_si(torch.cat([places[:, k], spreads[:, k, :3]], dim=1)))
+            parts += [] if frames is None else rotation_parts(frames[:, k : k + 1], spreads[:, k, 3:], table)
         return torch.cat([*parts, *others], dim=1)
 
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
-
-
-def _per_frame(names: Sequence[str], count: int) -> list[Sequence[str]]:
-    each = len(names) // count
-    return [names[k * each : (k + 1) * each] for k in range(count)]
 
 
 def write_rows(
@@ -131,10 +97,10 @@ def write_rows(
     Texts are written as they are, NaN becomes an empty cell.
     """
     with WholeFile(path) as file:
-        file.write(_text([names], table))
+        file.write(csv_text([names], table.sep))
         for block in blocks:
             rows = block.tolist() if isinstance(block, Tensor) else block
-            file.write(_text(([_cell(value, table) for value in row] for row in rows), table))
+            file.write(csv_text(([_cell(value, table) for value in row] for row in rows), table.sep))
 
 
 def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
@@ -148,9 +114,10 @@ def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> li
     return [numbers] if known is None else [numbers, known.rad2deg() if unit == "deg" else known]
 
 
-def _text(rows: Iterable[Sequence[str]], table: TableFormat) -> bytes:
+def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
+    """Rows of cells as CSV."""
     text = io.StringIO(newline="")
-    csv.writer(text, delimiter=table.sep).writerows(rows)
+    csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
     return text.getvalue().encode()
 
 
@@ -202,15 +169,13 @@ class Program:
         """
         values = joints.joints_from_si(q).tolist()
         places = [self.header.index(name) for name in joints.joints]
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, delimiter=table.sep)
-        writer.writerow([*self.header, *added])
+        lines = [[*self.header, *added]]
         for row, cells in enumerate(self.rows):
             line = list(cells)
             for place, value in zip(places, values[row], strict=True):
                 line[place] = _cell(value, table)
-            writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
-        write_whole(path, text.getvalue().encode())
+            lines.append([*line, *(_cell(column[row], table) for column in added.values())])
+        write_whole(path, csv_text(lines, table.sep))
 
 
 def _cell(value: str | float, table: TableFormat) -> str:
@@ -318,7 +283,7 @@ class _Sheet:
         session = (session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
         own = session if device is not None and device.session is not None else None
         readings = _reading_columns(whole, session)
-        on = None if device is None else _tips(device)
+        on = device and device.on and list(device.bodies.tips(device.on))
         columns = TableColumns((), triples, _socket_columns(whole), tuple(readings.values()), own, on=on)
         return cls(columns, table, readings)
 
@@ -334,27 +299,19 @@ class _Sheet:
         elif part.kind == "socket":
             found[SOCKET] = part.row_sockets
         else:
-            found |= _reading_cells(part, known, numeric)
+            scale = part.unit[1] if part.unit != MILLIMETRES else numeric.table.per_metre
+            scale = 1.0 if part.kind == "image" else scale
+            found |= _named(known.values, scale * part.reported.cpu())
+            found |= {} if part.std is None else _named(known.std, scale * part.reported_std.cpu())
         if part.payload is not None and numeric.payload:
             found[numeric.payload[0]] = part.payload.tolist()
         found |= _named(numeric.covariates, part.covariates) if numeric.covariates else {}
-        session = known.device if images else self._session
+        devices = (one.device for one in self.columns.readings if one.device is not None)
+        session = known.device if images else self.columns.session or next(devices, None)
         found |= {} if session is None or not any(part.device_names) else {session: part.device_names}
         if images:
             return corner_lines(part, found, numeric.table.per_metre)
         return found, torch.arange(len(part), device=HOST)
-
-    @property
-    def _session(self) -> str | None:
-        """Column of set-ups and devices."""
-        devices = (one.device for one in self.columns.readings if one.device is not None)
-        return self.columns.session or next(devices, None)
-
-
-def _tips(device: Any) -> list[str] | None:
-    if device.on is None:
-        return None
-    return list(device.on if device.poses is None else device.on[::3])
 
 
 def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -> TableFormat:
@@ -366,8 +323,7 @@ def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -
     if data.std is None:
         return table
     std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
-    given = [name for group in std for name in ([group] if isinstance(group, str) else group)]
-    check_count("columns of standard deviations", given, 3 * len(triples), "coordinate")
+    check_count("columns of standard deviations", flat_names(std), 3 * len(triples), "coordinate")
     return replace(table, std=std)
 
 
@@ -409,13 +365,6 @@ def _position_cells(data: Any, columns: Columns) -> dict[str, list[Any]]:
     for names, values in zip((columns.rotation, columns.rotation_std), rotations, strict=False):
         found |= _named(names, values)
     return found | ({} if data.std is None else _named(columns.std, columns.lengths_from_si(data.std)))
-
-
-def _reading_cells(data: Any, own: ReadingColumns, columns: Columns) -> dict[str, list[Any]]:
-    per_value = columns.table.per_metre if data.unit == MILLIMETRES else data.unit[1]
-    scale = 1.0 if data.kind == "image" else per_value
-    found = _named(own.values if isinstance(own.values, tuple) else (), scale * data.reported.cpu())
-    return found if data.std is None else found | _named(own.std, scale * data.reported_std.cpu())
 
 
 def _named(names: Sequence[str], values: Tensor) -> dict[str, list[Any]]:

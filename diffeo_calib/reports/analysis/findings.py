@@ -23,6 +23,7 @@ from diffeo_calib.kinematics.evaluation import (
     implausible,
     impossible,
     place,
+    residuals,
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
@@ -33,7 +34,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
-from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, errors_by_stage, expected_errors, stages_of
+from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, expected_errors, stages_of
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.known_drift import KnownDrift
 
@@ -134,7 +135,10 @@ def find(
     """
     check_arguments(model, data)
     if data is not None:
-        _check_markers(model, data)
+        check_rows(model, data)
+        if data.markers != model.markers:
+            fix = "pass the markers that the model predicts, in the same order"
+            raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
         data = _undrifted(model, place(model, data).aligned(data))
     progress("analysis", 0, STEPS)
     rows = FitRows(model, data)
@@ -142,7 +146,9 @@ def find(
     progress("analysis", 1, STEPS)
     kinematics = stages_of(model, rows) if stages is None else stages
     *before, own = kinematics
-    errors = errors_by_stage({name: kinematics[name] for name in before}, predictions.data)
+    seen = predictions.data
+    placed = {name: place(kinematics[name], seen) for name in before}
+    errors = {name: residuals(kinematics[name], at, seen).main for name, at in placed.items()}
     errors[own] = predictions.errors
     outliers = predictions.outliers(model)
     progress("analysis", 2, STEPS)
@@ -184,40 +190,20 @@ def check_arguments(model: object, data: object) -> None:
         raise InputError.of("`data`", expected=expected, got=type(data).__name__)
 
 
-def refuse_columns(against: Sequence[str]) -> None:
-    """Raise InputError for columns to show errors of positions against."""
-    if against:
-        fix = "leave them out: this page shows errors of each kind of rows in its own unit"
-        raise InputError.of("`against`", expected="a table of measured positions", got=", ".join(against), fix=fix)
-
-
-def _check_markers(model: CalibratedKinematics, data: Measurements) -> None:
-    """Raise InputError for joints in another order, and other markers."""
-    check_rows(model, data)
-    if data.markers != model.markers:
-        fix = "pass the markers that the model predicts, in the same order"
-        raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
-
-
 def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:
     """Those of rows that the model has not seen; if there are none, of the rows of the fit by all others."""
     new = None if data is None else unseen(model, data)
     if data is None or new is None:
-        _check_registered(model)
+        fitted = model.nominal.geometry.markers
+        if model.registration is not None and model.markers != fitted:
+            got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
+            fix = "pass rows that it has not seen, neither in the fit nor in the registration"
+            raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
         found = Predictions.of_fit(rows)
         LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
         return found
     LOG.info("judged by %d rows it has not seen, %d were used before", len(new), len(data) - len(new))
     return Predictions.of(model, new)
-
-
-def _check_registered(model: CalibratedKinematics) -> None:
-    """Raise InputError for a model that was registered at other markers: it cannot show the rows of its fit."""
-    fitted = model.nominal.geometry.markers
-    if model.registration is not None and model.markers != fitted:
-        got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
-        fix = "pass rows that it has not seen, neither in the fit nor in the registration"
-        raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
 
 
 def _repeats(
@@ -273,10 +259,5 @@ def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
     words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]
-    return {name: known[name] for name in chosen if _varies(known[name])}
-
-
-def _varies(values: Tensor) -> bool:
-    """Whether a column (N,) has different values; cells without one are NaN."""
-    there = values[values.isfinite()]
-    return not bool(torch.isclose(there, there[:1]).all())
+    there = {name: known[name][known[name].isfinite()] for name in chosen}  # NaN where a cell has no number
+    return {name: known[name] for name, own in there.items() if not bool(torch.isclose(own, own[:1]).all())}

@@ -56,12 +56,9 @@ class FitRows:
         registered = own.registration is not None
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
-        self._measured = measured if measured is not None and self._holds(measured) else None
-
-    def _holds(self, measured: Measurements) -> bool:
-        """Whether these are measurements of the rows, of the same markers."""
-        same = measured.q.shape == self.q.shape and torch.equal(measured.q.to(HOST), self.q)
-        return same and measured.points[0].numel() == self.map.m
+        self._measured = None
+        if measured is not None and measured.q.shape == self.q.shape and measured.points[0].numel() == self.map.m:
+            self._measured = measured if torch.equal(measured.q.to(HOST), self.q) else None
 
     def __len__(self) -> int:
         return len(self.q)
@@ -117,7 +114,7 @@ class FitRows:
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = order.tensor_split(ceil(n * m / BLOCK_COORDINATES))
         parts = [part.sort().values for part in parts]
-        return [(rows, factorise(self._at.rows(rows), self.map.noise.rows(rows))) for rows in parts]
+        return [(rows, factorise(self._linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
@@ -205,15 +202,15 @@ class FitRows:
         return whole if isinstance(whole, ExplicitParameterRegression) else self.blocks[0][1]
 
     @cached_property
-    def _at(self) -> Linearisation:
-        return self._linearised[1]
-
-    @cached_property
     def target(self) -> Tensor:
         """(N, m) measured (where hidden: predicted) minus the linear model at zero fields and parameters, m."""
         value, at = self._linearised
-        measured = self.points.flatten(1)
-        return torch.where(measured.isnan(), value, measured) - value + self._response(at)
+        measured, geodesic = self.points.flatten(1), self.map.geodesic
+        response = torch.einsum("imk,k->im", at.sensitivity, geodesic.momenta.theta)
+        for nodes, flow in ((at.joint, geodesic.joint_flow), (at.task, geodesic.task_flow)):
+            for node, controls in zip(nodes, flow.nodes, strict=True):
+                response = response + node.response(flow.kernel.field(node.points, *controls)).reshape(response.shape)
+        return torch.where(measured.isnan(), value, measured) - value + response
 
     @cached_property
     def _linearised(self) -> tuple[Tensor, Linearisation]:
@@ -224,15 +221,6 @@ class FitRows:
     def predicted(self) -> Tensor:
         """(N, P, 3) the markers by the fit itself, m."""
         return self._linearised[0].unflatten(1, (-1, 3))
-
-    def _response(self, at: Linearisation) -> Tensor:
-        """(N, m) linear effect of the model's own fields and parameters, m."""
-        geodesic = self.map.geodesic
-        total = torch.einsum("imk,k->im", at.sensitivity, geodesic.momenta.theta)
-        for nodes, flow in ((at.joint, geodesic.joint_flow), (at.task, geodesic.task_flow)):
-            for node, controls in zip(nodes, flow.nodes, strict=True):
-                total = total + node.response(flow.kernel.field(node.points, *controls)).reshape(total.shape)
-        return total
 
 
 def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, float] | None:

@@ -67,7 +67,8 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         return None
     data = data.rows(repeated)
     points = data.origins
-    predicted = {name: _positions(kinematics, data) for name, kinematics in stages.items()}
+    at_rows = {name: at_payloads(kinematics, data)(data.q).detach() for name, kinematics in stages.items()}
+    predicted = {name: data.bodies.origins(found) for name, found in at_rows.items()}  # (N, B, 3) m
     labels = data.groups()
     counts = torch.bincount(labels)
     *_, best = predicted.values()
@@ -110,8 +111,3 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
     variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
     largest = (distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max()
     return largest, float(distances.square().nansum()), int((seen - 1).clamp(min=0).sum())
-
-
-def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
-    """Predicted positions of the markers, or of the origins of measured poses: (N, B, 3) m."""
-    return data.bodies.origins(at_payloads(kinematics, data)(data.q).detach())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -20,10 +20,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import place, residuals
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.sensors.errors import Evaluation
 
 Kinematics = Callable[[Tensor], Tensor]
 
@@ -55,11 +52,6 @@ def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:
     }
 
 
-def errors_by_stage(stages: Mapping[str, Kinematics], data: Measurements) -> dict[str, Evaluation]:
-    """Errors of every stage on the same rows."""
-    return {name: residuals(kinematics, place(kinematics, data), data).main for name, kinematics in stages.items()}
-
-
 CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 """Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
 
@@ -80,11 +72,6 @@ class Deviations:
     measured: Tensor
     measured_deviation: Tensor
     error: ExpectedError
-
-    @property
-    def rms(self) -> float:
-        """RMS error expected anywhere in the ranges, m, apart from what the rows leave open."""
-        return self.error.workspace
 
     @property
     def measured_rms(self) -> float:

@@ -133,16 +133,8 @@ class Page:
 
 DOT = 0.2
 """Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
-VARIABLES = {
-    INK: "ink",
-    FAINT: "faint",
-    GRID: "grid",
-    GREY: "grey",
-    ORANGE: "orange",
-    BLUE: "blue",
-    GREEN: "green",
-    PURPLE: "purple",
-}
+VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GREY: "grey"}
+VARIABLES |= {ORANGE: "orange", BLUE: "blue", GREEN: "green", PURPLE: "purple"}
 """Colour of a figure -> the variable of the page's style that replaces it."""
 
 

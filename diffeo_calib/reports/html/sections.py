@@ -115,9 +115,8 @@ def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
 def devices(lines: Sequence[str]) -> Iterator[Section]:
     """Where devices are, if there is anything to say."""
     if lines:
-        see = (
-            "Where devices and sockets stand, and what was found from the rows shown because the model did not know it."
-        )
+        see = "Where devices and sockets stand, and what was found from the rows shown because the model did not know "
+        see += "it."
         yield Section("devices", "Devices", see, text=[printable(line) for line in lines])
 
 
@@ -179,16 +178,8 @@ def why(found: Findings) -> Section:
     robot = found.model.robot
     pictures = [parts_picture(found.parts)]
     for joint, name in enumerate(robot.joint_names):
-        pictures.append(
-            panel(
-                f"transmission-{joint}",
-                f"{name}: motion beyond its reading, with its 95 % band; below, where the joint was measured.",
-                draw_transmission,
-                found.model,
-                found.rows,
-                joint,
-            )
-        )
+        label = f"{name}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
+        pictures.append(panel(f"transmission-{joint}", label, draw_transmission, found.model, found.rows, joint))
     see = (
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
         "meshing; a wide band means that the joint was measured too little there."
@@ -299,19 +290,13 @@ def _largest(found: Findings) -> Table:
 
 
 def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
-    rows = [
-        [
-            str(one.number),
-            "" if one.marker is None else marker_name(one.marker, tips),
-            millimetres(one.distance),
-            one.reason,
-        ]
-        for one in outliers[:MOST_OUTLIERS]
-    ]
+    some = outliers[:MOST_OUTLIERS]
+    markers = ["" if one.marker is None else marker_name(one.marker, tips) for one in some]
+    pairs = zip(some, markers, strict=True)
+    rows = [[str(one.number), marker, millimetres(one.distance), one.reason] for one, marker in pairs]
     more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""
-    return Table(
-        f"Rows that look wrong{more}; none was dropped", ["row", "marker", "off by [mm]", "why"], rows, numeric=False
-    )
+    caption = f"Rows that look wrong{more}; none was dropped"
+    return Table(caption, ["row", "marker", "off by [mm]", "why"], rows, numeric=False)
 
 
 def repeatability(found: Findings) -> Section:
@@ -321,22 +306,14 @@ def repeatability(found: Findings) -> Section:
         see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
         note = "Repeat five poses, 30 times each, and pass the table with --data."
         return Section("repeatability", "Repeatability", see, notes=[note])
-    names = list(repeats.accuracy)
-    header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in names)]
+    header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in repeats.accuracy)]
+    columns = [repeats.repeatability, *repeats.accuracy.values()]
     rows = [
-        [
-            f"row {int(line)}",
-            str(int(count)),
-            millimetres(float(rp)),
-            *(millimetres(float(repeats.accuracy[name][k])) for name in names),
-        ]
-        for k, (line, count, rp) in enumerate(zip(repeats.lines, repeats.counts, repeats.repeatability, strict=True))
+        [f"row {int(line)}", str(int(count)), *(millimetres(float(values[k])) for values in columns)]
+        for k, (line, count) in enumerate(zip(repeats.lines, repeats.counts, strict=True))
     ][:MOST_REPEATS]
-    worst = ["worst", "", millimetres(float(repeats.repeatability.max()))]
-    mean = ["mean", "", millimetres(float(repeats.repeatability.mean()))]
-    for name in names:
-        worst.append(millimetres(float(repeats.accuracy[name].max())))
-        mean.append(millimetres(float(repeats.accuracy[name].mean())))
+    worst = ["worst", "", *(millimetres(float(values.max())) for values in columns)]
+    mean = ["mean", "", *(millimetres(float(values.mean())) for values in columns)]
     see = (
         f"{len(repeats.counts)} poses were measured several times: single measurements are "
         f"{millimetres(repeats.deviation)} mm RMS away from their mean, which limits the RMS error of any model."

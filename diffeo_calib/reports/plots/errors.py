@@ -62,7 +62,9 @@ def draw_distributions(
     one = next(iter(evaluations.values()))
     unit, per_unit = ("deg", 1.0) if angles else one.shown
     for (name, found), look in zip(evaluations.items(), LOOKS, strict=False):
-        errors = np.sort(_degrees(found.angles) if angles and found.angles is not None else _sizes(found))
+        turned = found.angles if angles else None
+        sizes = _sizes(found) if turned is None else np.maximum(turned.rad2deg().numpy(), SMALLEST_ERROR)
+        errors = np.sort(sizes)
         share = np.arange(1, len(errors) + 1) / len(errors)
         rms = found.angle_rms if angles else per_unit * found.rms
         label = f"{name}: {rms:.3g} {unit} RMS"
@@ -92,10 +94,6 @@ def draw_before_after(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None
 def _sizes(evaluation: Evaluation) -> np.ndarray:
     """Known errors in the unit in which they are shown."""
     return np.maximum(evaluation.shown[1] * known(evaluation.errors).numpy(), SMALLEST_ERROR)
-
-
-def _degrees(angles: Tensor) -> np.ndarray:
-    return np.maximum(angles.rad2deg().numpy(), SMALLEST_ERROR)
 
 
 ARROW_SHARE = 0.12
