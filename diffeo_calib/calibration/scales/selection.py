@@ -21,7 +21,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.process.factor import Factor
+from diffeo_calib.regression.factor import Factor
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
 
 MESHING_LENGTHSCALE_RAD = 0.22
