@@ -199,17 +199,14 @@ class _Search:
 
     def climb(self, starts: Sequence[Hyperparameters], iterations: int) -> None:
         """Run the optimiser from each start."""
+        from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
+
         self.total = len(starts) * iterations
         for number, start in enumerate(starts):
             self.done, self.ends = number * iterations, (number + 1) * iterations
-            self._climb(start, iterations)
-
-    def _climb(self, start: Hyperparameters, iterations: int) -> None:
-        from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
-
-        x0 = start.logarithms().numpy()
-        with torch_alone():
-            minimize(self._objective, x0, jac=True, method="L-BFGS-B", options={"maxiter": iterations})
+            options, x0 = {"maxiter": iterations}, start.logarithms().numpy()
+            with torch_alone():
+                minimize(self._objective, x0, jac=True, method="L-BFGS-B", options=options)
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus the log posterior and its gradient, for scipy."""
