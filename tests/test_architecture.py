@@ -37,7 +37,7 @@ FLOORS = (
     # where they meet
     ("process.factor", "a covariance with features of any variance, factorised"),
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
-    ("paper", "the paper's own formulation, algorithms and figures"),
+    ("paper", "the paper's own formulation"),
     ("process", "what is known of robot and devices from rows: one Gaussian process"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),

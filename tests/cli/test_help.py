@@ -172,7 +172,7 @@ OPTIONS = {
         ),
         *("--title", "--against", "--tolerance"),
     ],
-    "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
+    "demo": ["-o", "--output", "--rows", "--seed"],
 }
 for _options in OPTIONS.values():
     _options.append("--json")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from listings import Descent, Discretisation, evaluate, lr_calibration
 from math_bank import few_points, uniform
+from section_5 import section_5
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.paper.eulerian import Eulerian
-from diffeo_calib.paper.figures import Descent, Discretisation, evaluate, lr_calibration, section_5
 from diffeo_calib.robots import elastic_rr
 
 STEP = 0.05
