@@ -59,8 +59,6 @@ OPTIONS = {
             "--payload",
             "--target",
             "--stdin",
-            "--listen",
-            "--token",
             "--json-lines",
             "--bag",
             "--seen",
