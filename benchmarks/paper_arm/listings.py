@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, check_number
-from diffeo_calib.common.errors import InputError, NumericalError, as_written
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.objective import slope
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
-from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem, checked_equations
+from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem
 
 Nominal = NominalMap | Callable[[Tensor], Tensor]
 Calibration = tuple[Tensor, Tensor, Nominal, Kernel, Kernel]
@@ -46,12 +46,12 @@ class Discretisation(NamedTuple):
     """Variant and time stepping of (17) and (20).
 
     Args:
-        equations: the errata to keep as printed; by default those of :class:`Eulerian`.
-        integrator: RK4 with two steps by default.
+        equations: the errata to keep as printed.
+        integrator: of both flows.
     """
 
-    equations: Eulerian | None = None
-    integrator: Integrator | None = None
+    equations: Eulerian = Eulerian()
+    integrator: Integrator = RK4(2)
 
 
 def lr_calibration(  # noqa: PLR0917  # as printed
@@ -87,7 +87,7 @@ def lr_calibration(  # noqa: PLR0917  # as printed
     check_number(mu, "`mu`", above=0.0)
     check_number(epsilon, "`epsilon`", above=0.0)
     check_count(max_iter, "`max_iter`")
-    equations, integrator = _checked(discretisation)
+    equations, integrator = discretisation or Discretisation()
     problem = EulerianProblem(Problem(k, X, Y, joint_kernel=K_V, task_kernel=K_W, noise=sigma), equations)
     P0 = torch.zeros_like(problem.y)  # Initialize P_0 = (P_0^1, ..., P_0^N) <- 0
     i = 0  # Set iteration counter (printed: k <- 0, which shadows the kinematics)
@@ -128,7 +128,7 @@ def evaluate(  # noqa: PLR0917  # as printed
         InputError: wrong shapes or values.
         NumericalError: the flow overflows.
     """
-    equations, integrator = _checked(discretisation)
+    equations, integrator = discretisation or Discretisation()
     X = as_tensor(X, "X", ("N", "n"))
     P0 = as_tensor(P0, "P0", (len(X), "m"), fix="pass what `lr_calibration` returned")
     check_kernel(K_V, X.shape[1], "K_V")
@@ -140,10 +140,3 @@ def evaluate(  # noqa: PLR0917  # as printed
     found = k1(at), k1.jacobian(at)  # Solve ODEs (20); (k_1(xi), Dk_1(xi))
     check_finite(found[0], "k(xi)")
     return found
-
-
-def _checked(discretisation: Discretisation | None) -> tuple[Eulerian, Integrator]:
-    equations, integrator = discretisation or Discretisation()
-    if integrator is not None and not isinstance(integrator, Integrator):
-        raise InputError.of("`integrator`", expected="dc.RK4(2), dc.RK8(1) or the like", got=as_written(integrator))
-    return checked_equations(equations), integrator or RK4(2)

@@ -56,9 +56,6 @@ def test_algorithm_2_is_the_fitted_model(equations: Eulerian) -> None:
         evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
     with pytest.raises(InputError, match="`K_V`: expected a kernel"):
         evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
-    for wrong, name in (({"equations": "printed"}, "equations"), ({"integrator": "rk4"}, "integrator")):
-        with pytest.raises(InputError, match=f"`{name}`: expected"):
-            evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, Discretisation(**wrong))  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"`k\(xi\)`"):
         evaluate(xi * 0 + 7, problem.x, fit.momenta.task, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
     assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.task, elastic_rr.nominal, *K)] == [

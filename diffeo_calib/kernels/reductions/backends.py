@@ -155,7 +155,7 @@ def evaluate(
             formula, profile, *(rows, columns) if name == "fused" else _centred(rows, columns)
         )
     except keops.KeopsUnavailableError as error:
-        keops.warn(error)
+        keops.warn(str(error))
         found = None
     return found or Tiled().reduce(formula, profile, *_centred(rows, columns))
 
