@@ -296,7 +296,11 @@ class Symbol(Unknown):
 
     def __add__(self, other: Symbol | float) -> Symbol:
         if self.scale == 0.0:
-            return self._constant(other) if not isinstance(other, Symbol) else other
+            if isinstance(other, Symbol):
+                return other
+            out = Matrix(self.pool, *self.matrix.shape)
+            out.values.fill_(other)
+            return Symbol(self.pool, 1.0, out)
         a, out = self._fresh()
         if isinstance(other, Symbol):
             torch.add(a, other.matrix, alpha=other.scale / self.scale, out=out.values)
@@ -346,11 +350,6 @@ class Symbol(Unknown):
     def _check_positive(self) -> None:
         if self.scale <= 0.0:
             raise RuntimeError("sqrt and relu of a negative multiple are not implemented: no profile needs them")
-
-    def _constant(self, value: float) -> Symbol:
-        out = Matrix(self.pool, *self.matrix.shape)
-        out.values.fill_(value)
-        return Symbol(self.pool, 1.0, out)
 
 
 @cache
