@@ -36,7 +36,7 @@ FLOORS = (
     ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
-    ("paper", "the paper's own formulation, algorithms and figures"),
+    ("paper", "the paper's own formulation"),
     ("process", "what is known of robot and devices from rows: one Gaussian process"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),

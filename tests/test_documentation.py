@@ -116,8 +116,6 @@ def test_commands_run_one_after_the_other(folder: Path, command: Command, monkey
     for line in dict.fromkeys(whole):
         program, *arguments = shlex.split(line)
         assert program == "diffeo-calib"
-        if "--paper" in arguments:  # tests/paper
-            continue
         real = any(word.startswith("data/") for word in arguments)
         if real and not (folder / "data").is_dir():
             continue

@@ -20,7 +20,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+sys.path[:0] = [str(Path(__file__).parents[1] / room) for room in ("paper_arm", "")]  # shared modules
 
 import os
 import time
@@ -33,12 +33,12 @@ import torch.distributed as messages
 from harness import Record
 from landmarks import LENGTHSCALE, landmarks
 from ours import Ours
+from section_5 import section_5
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.kernels.reductions import distributed
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 SIZES = {"sum": (4096, 16384, 65536), "loss_and_gradient": (1024, 4096), "fit": (12_000,)}

@@ -31,9 +31,9 @@ import harness
 import torch
 from harness import Record
 from held_out import exponents
+from section_5 import section_5
 
 import diffeo_calib as dc
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 ROWS, QUICK_ROWS = (1000, 3000, 10_000, 30_000), (1000, 3000)

@@ -35,11 +35,11 @@ from rr_calibrations import Calibrated, calibrate, first_scales, geometric_fit
 from rr_methods import GEOMETRY, PAPER_FLOW
 from rr_models import Recipe, around, leave_one_out
 from sample_efficiency import NOISE, Case, errors
+from section_5 import section_5
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.paper.figures import section_5
 
 PROFILES = {
     "Gaussian": GaussianProfile(),

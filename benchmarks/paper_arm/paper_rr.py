@@ -52,6 +52,7 @@ from statistics import median
 import rr_bed
 import torch
 from harness import Record, run
+from section_5 import section_5
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -60,7 +61,6 @@ from diffeo_calib.fitting.fit import Formulation, Solver, formulate
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.flows.integrators import Integrator, RungeKutta
-from diffeo_calib.paper.figures import section_5
 
 GRID = 16
 SIGMAS = (0.01, 0.001)

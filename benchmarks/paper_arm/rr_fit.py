@@ -29,11 +29,11 @@ from dataclasses import replace
 
 import rr_bed
 from harness import Record, run
+from section_5 import section_5
 
 import diffeo_calib as dc
 from diffeo_calib.fitting.fit import Solver
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.paper.figures import section_5
 
 SIGMAS = (0.01, 0.001)
 INTEGRATORS = (dc.RK4(1), dc.RK4(2), dc.RK4(4), dc.RK8(1), None)

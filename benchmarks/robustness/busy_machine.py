@@ -15,8 +15,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
-sys.path.insert(0, str(Path(__file__).parents[1] / "kernel_sums"))
+sys.path[:0] = [str(Path(__file__).parents[1] / room) for room in ("kernel_sums", "paper_arm", "")]  # shared modules
 
 import subprocess
 import tempfile
@@ -31,9 +30,9 @@ import torch
 from harness import Record
 from landmarks import landmarks
 from ours import Ours
+from section_5 import section_5
 
 import diffeo_calib as dc
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 REPEATS, QUICK_REPEATS = 7, 2

@@ -2,13 +2,13 @@
 
     python benchmarks/robustness/campaign_faults.py [--count 200] [--seed 0] [--out campaign_faults.json]
 
-Six rows are sent over a socket, or appended to the table by another program, while something fails at a random moment:
+Six rows are sent over standard input, or appended to the table by another program, while something fails:
 
 * kill: SIGKILL ends the campaign; it is started again.
 * full disk: files cannot grow beyond a random size (RLIMIT_FSIZE); then they can, and the campaign is started again.
-* cut socket: a connection is cut after a row was sent, or within it.
+* cut pipe: the input ends after a row was sent, or within it; the campaign is started again for every row.
 * half a line: another program appends lines to the table in pieces of random lengths.
-* two writers: a second campaign of the same table is started, and two programs send rows at the same time.
+* two writers: a second campaign of the same table is started while a program sends rows.
 
 A program sends rows again that were not answered. At the end the table must hold each row once, with the numbers that
 were sent, and the journal one verdict for each. Fields of a record: `fault`, `count`, `faults` that struck (rows were
@@ -23,7 +23,6 @@ import os
 import random
 import resource
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -71,31 +70,21 @@ class Site:
     draw: random.Random
     wanted: list[Row]
     answered: set[int] = field(default_factory=set)
-    port: int = 0
     process: int = 0
     failed: int = 0
 
-    def run(self, limit: int | None = None) -> None:
+    def run(self, limit: int | None = None) -> Client:
         """Start the campaign; files cannot grow beyond ``limit`` bytes."""
-        self.port = self.draw.randrange(20000, 30000)
         words = ["campaign", str(self.folder / "run.csv"), "--robot", str(self.folder / "arm.urdf"), *OPTIONS]
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         if limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-        self.process = start([*words, "--listen", str(self.port)])
+        (stdin, rows), (answers, stdout) = os.pipe(), os.pipe()
+        self.process = start([*words, "--stdin", "--json-lines"], (stdin, stdout))
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-    def connected(self) -> Client:
-        """A connection to the campaign; ConnectionError if it has ended."""
-        begin = time.monotonic()
-        while True:
-            try:
-                return Client(self.port)
-            except (OSError, ValueError) as error:
-                gone = os.waitid(os.P_PID, self.process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-                if gone or time.monotonic() - begin > SECONDS:
-                    raise ConnectionError from error
-                time.sleep(0.01)
+        os.close(stdin)
+        os.close(stdout)
+        return Client(rows, answers)
 
     def send(self, client: Client, number: int) -> None:
         """Send a row and note its answer; ConnectionError without one."""
@@ -103,22 +92,22 @@ class Site:
         if "line" in answer:
             self.answered.add(number)
 
-    def end(self, with_signal: int = signal.SIGINT) -> int:
-        """End the campaign; its exit code."""
-        os.kill(self.process, with_signal)
-        return ended(self.process)
+    def killed(self) -> bool:
+        """End the campaign by SIGKILL; whether it was still running."""
+        os.kill(self.process, signal.SIGKILL)
+        return ended(self.process) == -signal.SIGKILL
 
     def finish(self) -> None:
         """Start the campaign again and send what was not answered, as programs do."""
-        self.run()
-        try:
-            with self.connected() as client:
+        with self.run() as client:
+            try:
                 for number in range(ROWS):
                     if number not in self.answered:
                         self.send(client, number)
-        except ConnectionError:
-            self.failed = 1
-        self.end()
+            except ConnectionError:
+                self.failed = 1
+            client.rows.close()
+            ended(self.process)
 
     def losses(self) -> dict[str, int]:
         """What became of the rows."""
@@ -138,40 +127,30 @@ class Site:
 
 
 class Client:
-    """A program that sends rows."""
+    """A program that sends rows, through two pipes."""
 
-    def __init__(self, port: int) -> None:
-        with socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as connection:
-            self.lines = connection.makefile("rwb")
-        try:
-            self.read()
-        except ConnectionError:
-            self.close()
-            raise
+    def __init__(self, rows: int, answers: int) -> None:
+        self.rows, self.answers = os.fdopen(rows, "wb", buffering=0), os.fdopen(answers, "rb")
 
     def __enter__(self) -> Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Cut the connection."""
-        with suppress(OSError):
-            self.lines.close()
+        self.rows.close()
+        self.answers.close()
 
     def read(self) -> dict[str, object]:
-        """An answer."""
-        try:
-            return json.loads(self.lines.readline())
-        except (OSError, ValueError) as error:
-            raise ConnectionError from error
+        """The answer to a row; what a campaign says by itself is skipped."""
+        while line := self.answers.readline():
+            answer = json.loads(line)
+            if answer.keys() & {"id", "error"}:
+                return answer
+        raise ConnectionError
 
     def write(self, content: bytes) -> None:
         """Send bytes."""
         try:
-            self.lines.write(content)
-            self.lines.flush()
+            self.rows.write(content)
         except OSError as error:
             raise ConnectionError from error
 
@@ -192,14 +171,13 @@ def as_line(row: Row) -> bytes:
 
 def kill(site: Site) -> bool:
     """SIGKILL while a row is on its way."""
-    site.run()
     at = site.draw.randrange(ROWS)
-    with site.connected() as client:
+    with site.run() as client:
         for number in range(at):
             site.send(client, number)
         client.write(as_line(site.wanted[at]))
         time.sleep(site.draw.uniform(0.0, 0.02))
-        killed = site.end(signal.SIGKILL) == -signal.SIGKILL
+        killed = site.killed()
         with suppress(ConnectionError):
             if "line" in client.read():
                 site.answered.add(at)
@@ -208,73 +186,66 @@ def kill(site: Site) -> bool:
 
 def full_disk(site: Site) -> bool:
     """Files that cannot grow."""
-    site.run(site.draw.randrange(1500))
-    try:
-        with site.connected() as client:
+    with site.run(site.draw.randrange(1500)) as client:
+        with suppress(ConnectionError):
             for number in range(ROWS):
                 site.send(client, number)
-    except ConnectionError:
-        pass
-    struck = len(site.answered) < ROWS
-    with suppress(ProcessLookupError):
-        site.end()
-    return struck
+        client.rows.close()
+        ended(site.process)
+    return len(site.answered) < ROWS
 
 
-def cut_socket(site: Site) -> bool:
+def cut_pipe(site: Site) -> bool:
     """Every row is cut once, at a random byte, or sent without waiting for its answer."""
-    site.run()
     for number in range(ROWS):
-        with site.connected() as client:
-            content = as_line(site.wanted[number])
+        content = as_line(site.wanted[number])
+        with site.run() as client:
             client.write(content[: site.draw.randrange(1, len(content) + 1)])
-        with site.connected() as client:
+            client.rows.close()
+            ended(site.process)
+        with site.run() as client:
             site.send(client, number)
-    site.end()
+            client.rows.close()
+            ended(site.process)
     return True
 
 
 def half_a_line(site: Site) -> bool:
-    """Another program that appends to the table in pieces; the campaign is killed and goes on meanwhile."""
+    """Another program that appends to the table in pieces, while the campaign follows it."""
     header = ",".join(site.wanted[0])
     content = "".join(f"{line}\n" for line in [header, *(",".join(map(repr, row.values())) for row in site.wanted)])
-    site.run()
-    with (site.folder / "run.csv").open("a") as file:
-        while content:
-            size = site.draw.randrange(1, 200)
-            file.write(content[:size])
-            file.flush()
-            content = content[size:]
-            time.sleep(site.draw.uniform(0.0, 0.05))
-    with site.connected() as client:
+    with site.run() as client:
+        with (site.folder / "run.csv").open("a") as file:
+            while content:
+                size = site.draw.randrange(1, 200)
+                file.write(content[:size])
+                file.flush()
+                content = content[size:]
+                time.sleep(site.draw.uniform(0.0, 0.05))
         for number in range(ROWS):
             site.send(client, number)
-    site.end()
+        client.rows.close()
+        ended(site.process)
     return True
 
 
 def two_writers(site: Site) -> bool:
-    """Two programs that send rows at the same time, and a second campaign."""
-    site.run()
-    with site.connected() as one, site.connected() as two:
-        first, port = site.process, site.port
-        site.run()
-        for number in range(0, ROWS, 2):
-            one.write(as_line(site.wanted[number]))
-            two.write(as_line(site.wanted[number + 1]))
-            for client, row in ((one, number), (two, number + 1)):
-                if "line" in client.read():
-                    site.answered.add(row)
-        refused = ended(site.process) == 1
-        site.process, site.port = first, port
-    site.end()
+    """A second campaign, which must be refused."""
+    with site.run() as client:
+        first = site.process
+        with site.run():
+            for number in range(ROWS):
+                site.send(client, number)
+            refused = ended(site.process) == 1
+        client.rows.close()
+        ended(first)
     return refused
 
 
 FAULTS: dict[str, Callable[[Site], bool]] = {
     "kill": kill,
     "full disk": full_disk,
-    "cut socket": cut_socket,
+    "cut pipe": cut_pipe,
     "half a line": half_a_line,
     "two writers": two_writers,
 }
@@ -292,7 +263,7 @@ def struck(name: str, count: int, seed: int) -> harness.Record:
             except ConnectionError:
                 site.failed = 1
                 with suppress(ProcessLookupError, ChildProcessError):
-                    site.end(signal.SIGKILL)
+                    site.killed()
             found["answered"] += len(site.answered)
             site.finish()
             for loss, number in site.losses().items():

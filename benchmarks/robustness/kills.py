@@ -58,8 +58,12 @@ class Target:
     sound: Callable[[Path], bool]
 
 
-def start(arguments: list[str]) -> int:
-    """Start a command in a copy of this process, without output; returns the number of the process."""
+def start(arguments: list[str], streams: tuple[int, int] | None = None) -> int:
+    """Start a command in a copy of this process; returns the number of the process.
+
+    Args:
+        streams: standard input and output, by default nowhere.
+    """
     process = os.fork()
     if process:
         return process
@@ -68,6 +72,9 @@ def start(arguments: list[str]) -> int:
         nowhere = os.open(os.devnull, os.O_RDWR)
         for number in range(3):
             os.dup2(nowhere, number)
+        for number, stream in enumerate(streams or ()):
+            os.dup2(stream, number)
+        os.closerange(3, 256)  # the other ends of pipes
         sys.argv = ["diffeo-calib", *arguments]
         command_line()
         code = 0

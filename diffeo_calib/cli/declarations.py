@@ -15,8 +15,6 @@ from diffeo_calib.cli.app import app, command
 from diffeo_calib.cli.record import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
 
-DEMO_ROWS = 300
-
 
 @command("fit")
 def fit_command(
@@ -435,28 +433,16 @@ def demo_command(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write everything to.")
     ] = Path("demo_output"),
-    rows: Annotated[
-        int | None, typer.Option("--rows", min=20, help=f"Number of simulated measurements, {DEMO_ROWS} by default.")
-    ] = None,
+    rows: Annotated[int, typer.Option("--rows", min=20, help="Number of simulated measurements.")] = 300,
     seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, max=options.LARGEST_SEED, help="Seed of the arm and the noise, 0 by default."),
-    ] = None,
-    paper: Annotated[
-        bool, typer.Option("--paper", help="The elastic RR arm of the paper's section 5 instead, and its figures.")
-    ] = False,
+        int, typer.Option("--seed", min=0, max=options.LARGEST_SEED, help="Seed of the arm and the noise.")
+    ] = 0,
 ) -> None:
     """Simulate a robot and calibrate it as a user would.
 
-    The robot is an elastic six-axis arm, measured by a laser tracker. --paper takes the arm of the paper instead.
+    The robot is an elastic six-axis arm, measured by a laser tracker.
     """
-    if paper and not (rows is None and seed is None):
-        what = "--rows and --seed belong to the simulated arm: section 5 of the paper has 256 points without noise"
-        raise InputError.of(what, fix="leave them out, or leave --paper out")
     make_folder(output)
     from diffeo_calib.cli.commands import demo  # noqa: PLC0415
 
-    if paper:
-        demo.run_paper(output)
-        return
-    app(demo.simulate(output, rows=DEMO_ROWS if rows is None else rows, seed=0 if seed is None else seed))
+    app(demo.simulate(output, rows, seed))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.campaign.campaign import Campaign, Next
-from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Sent, as_line, check_cells
+from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, as_line, check_cells
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
@@ -134,13 +134,13 @@ class Live:
             self._say(({"text": changed} if changed else {}) | self.state())
         return True
 
-    def take(self, sent: Sent) -> None:
+    def take(self, entry: Entry | DiffeoCalibError) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
         told: Entry = {}
         try:
-            if isinstance(sent.entry, DiffeoCalibError):
-                raise sent.entry
-            check_cells(entry := sent.entry)
+            if isinstance(entry, DiffeoCalibError):
+                raise entry
+            check_cells(entry)
             told |= {ID: entry[ID]} if ID in entry else {}
             if "do" in entry:
                 self.decide(entry.get("line"), entry["do"])
@@ -152,7 +152,6 @@ class Live:
         except InputError as error:
             told["error"] = str(error)
         self._say(told)
-        sent.answer(told)
 
     def known(self, row: Entry) -> int | None:
         """Number of the line that a row repeats; InputError for other values under its id."""

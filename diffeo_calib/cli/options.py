@@ -292,18 +292,8 @@ class LiveOptions:
 
     target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
-        "Append rows from standard input to CSV, one JSON object a line: its keys are the columns.", default=False
-    )
-    listen: str | None = option(
-        "Take the same lines from a socket of this machine, 0 for any free port, and answer each: "
-        "campaign/feeds.py describes them. Addresses of other machines need --token.",
-        "[HOST:]PORT",
-    )
-    token: str = option(
-        "What a program must send first to --listen; other users of this machine see what is typed, not the variable.",
-        "TEXT",
-        default="",
-        envvar="DIFFEO_CALIB_TOKEN",
+        "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.",
+        default=False,
     )
     json_lines: bool = option(
         "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False

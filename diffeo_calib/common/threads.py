@@ -56,7 +56,9 @@ def small_work() -> Iterator[None]:
 
     torch keeps the number of threads for each thread of the program; other threads keep theirs.
     """
-    if _compiling():
+    import torch  # noqa: PLC0415  # see above
+
+    if torch.compiler.is_compiling():  # a recorded program knows no threads
         yield
         return
     count = allowed_threads()
@@ -98,13 +100,6 @@ def in_parallel(function: Callable[[T], R], parts: Sequence[T]) -> Iterator[R]:
     count = allowed_threads()
     with small_work():  # restores torch's number of threads for threads to come, which the workers set to one
         yield from map(function, parts) if count == 1 or len(parts) == 1 else _workers(count).map(function, parts)
-
-
-def _compiling() -> bool:
-    """Whether torch traces a program, which knows no threads."""
-    import torch  # noqa: PLC0415  # see above
-
-    return torch.compiler.is_compiling()
 
 
 def _set_torch_threads(count: int) -> None:

@@ -160,15 +160,12 @@ class _Run:
             momenta = self.momenta()
         found = slope(self.problem, self.integrator, momenta, self.variables)
         if found is None:
-            return self._overflow()
+            self.evaluations += 1
+            self.variables.grad = torch.zeros_like(self.variables)
+            return self.origin.new_tensor(OVERFLOW_ENERGY_RATIO * (abs(self.best_energy) + 1.0))
         total, self.variables.grad = found
         self._note(momenta, float(total))
         return total
-
-    def _overflow(self) -> Tensor:
-        self.evaluations += 1
-        self.variables.grad = torch.zeros_like(self.variables)
-        return self.origin.new_tensor(OVERFLOW_ENERGY_RATIO * (abs(self.best_energy) + 1.0))
 
     def _note(self, momenta: Momenta, energy: float) -> None:
         self.evaluations += 1

@@ -284,8 +284,8 @@ class SumKernel(Kernel):
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
-        diagonal, rest = self._split
-        parts = [t.gram(x, left, y, right) for t in rest]
+        diagonal = [t for t in self.terms if isinstance(t, DiagonalKernel)]
+        parts = [t.gram(x, left, y, right) for t in self.terms if not isinstance(t, DiagonalKernel)]
         if diagonal:
             values = chain.from_iterable(term.diagonal(x, y) for term in diagonal)
             parts.append(component_gram(values, left, right))
@@ -294,12 +294,6 @@ class SumKernel(Kernel):
     def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
         """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k)."""
         return _total(t.own_blocks(x, effect) for t in self.terms)
-
-    @property
-    def _split(self) -> tuple[list[DiagonalKernel], list[Kernel]]:
-        """Terms whose values are diagonal matrices, and the remaining terms."""
-        diagonal = [t for t in self.terms if isinstance(t, DiagonalKernel)]
-        return diagonal, [t for t in self.terms if not isinstance(t, DiagonalKernel)]
 
 
 def check_kernel(kernel: object, dim: int, name: str) -> None:

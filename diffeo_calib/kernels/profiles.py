@@ -114,10 +114,7 @@ def _derivative(r2: Tensor, profile: Profile, order: int) -> Tensor:
 class GaussianProfile(Profile):
     """kappa = exp(-r2 / 2); on circles the von Mises kernel."""
 
-    @property
-    def name(self) -> str:
-        """ "gaussian"."""
-        return "gaussian"
+    name = "gaussian"
 
     def spectral_density(self, w2: Tensor, dim: int) -> Tensor:
         """(2 pi)^(-dim / 2) exp(-w2 / 2)."""
@@ -137,10 +134,7 @@ class GaussianProfile(Profile):
 class CauchyProfile(Profile):
     """kappa = 1 / (1 + r2), a heavy-tailed mixture of Gaussians (rational quadratic, alpha = 1)."""
 
-    @property
-    def name(self) -> str:
-        """ "cauchy"."""
-        return "cauchy"
+    name = "cauchy"
 
     def derivative(self, r2: Any, order: int) -> Any:
         """(-1)^k k! (1 + r2)^-(k + 1)."""
@@ -156,10 +150,7 @@ class CauchyProfile(Profile):
 class ConstantProfile(Profile):
     """kappa = 1: a rigid translation of all points."""
 
-    @property
-    def name(self) -> str:
-        """ "constant"."""
-        return "constant"
+    name = "constant"
 
     def derivative(self, r2: Any, order: int) -> Any:
         """1, then 0."""

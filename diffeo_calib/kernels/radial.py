@@ -74,7 +74,9 @@ class RadialKernel(DiagonalKernel):
         check_profile(profile)
         self.profile = profile
         self.lengthscale = positive(lengthscale, "lengthscale", scalar_or_vector(lengthscale))
-        self.variance = _non_negative(variance)
+        self.variance = as_tensor(variance, "variance", scalar_or_vector(variance))
+        if bool((self.variance < 0).any()):
+            raise InputError.of("`variance`", expected="non-negative numbers", got=self.variance.detach().tolist())
         self.periodic = periodic if isinstance(periodic, bool) else tuple(bool(p) for p in periodic)
         self.columns = None if columns is None else tuple(int(c) for c in columns)
         self.output = output
@@ -300,13 +302,6 @@ def scalar_or_vector(value: object) -> tuple[str, ...]:
     if isinstance(value, Tensor):
         return ("n",) * min(value.ndim, 1)
     return ("n",) if isinstance(value, Sequence) or getattr(value, "ndim", 0) else ()
-
-
-def _non_negative(variance: object) -> Tensor:
-    tensor = as_tensor(variance, "variance", scalar_or_vector(variance))
-    if bool((tensor < 0).any()):
-        raise InputError.of("`variance`", expected="non-negative numbers", got=tensor.detach().tolist())
-    return tensor
 
 
 def Gaussian(lengthscale: object = 1.0, variance: object = 1.0, *, space: Space | None = None) -> RadialKernel:

@@ -86,17 +86,13 @@ class Distances(Observation):
     """
 
     constants = ("fixed", "offsets")
+    size = 1
 
     def __init__(self, fixed: object, offsets: object = None) -> None:
         self.fixed = as_tensor(fixed, "fixed", ("N", "m"), fix="pass the fixed point of every row, in m").detach()
         none = self.fixed.new_zeros(len(self.fixed), 1)
         given = none if offsets is None else as_tensor(offsets, "offsets", (len(self.fixed), 1))
         self.offsets = given.detach()
-
-    @property
-    def size(self) -> int:
-        """1."""
-        return 1
 
     def value(self, points: Tensor) -> Tensor:
         """Distances (N, 1), m."""
@@ -168,21 +164,12 @@ class CameraPoints(Observation):
     """
 
     constants = ("poses", "focal")
+    dim, size = 3, 2
 
     def __init__(self, poses: object, focal: object = None) -> None:
         self.poses = as_tensor(poses, "poses", ("N", 4, 4), fix="pass one rigid transform per row").detach()
         one = self.poses.new_ones(len(self.poses), 1)
         self.focal = one if focal is None else as_tensor(focal, "focal", (len(one), 1)).detach()
-
-    @property
-    def dim(self) -> int:
-        """3."""
-        return 3
-
-    @property
-    def size(self) -> int:
-        """2."""
-        return 2
 
     def _seen(self, points: Tensor) -> Tensor:
         """Points in the camera's frame (N, 3), m."""

@@ -1,1 +1,1 @@
-"""The paper's own formulation, algorithms and figures, kept for comparison."""
+"""The paper's own formulation, kept for comparison."""

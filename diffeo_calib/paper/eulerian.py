@@ -33,7 +33,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, NumericalError, as_written, sentence
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.fitting.objective import Objective, Start, tangent
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.geodesic import energy
@@ -312,11 +312,12 @@ class EulerianProblem(Objective[EulerianDeformation]):
 
     def __init__(self, exact: Problem, equations: Eulerian | None = None) -> None:
         if exact.reduced:
-            raise InputError(_NO_CONTROLS)
+            what = "the Eulerian formulation has a momentum at every measurement: fewer `controls` are not possible"
+            raise InputError.of(what, fix='leave `controls` out, or pass formulation="exact"')
         if exact.observe is not None:
             fix = 'leave `observe` out, or pass formulation="exact"'
             raise InputError.of("`observe` in the Eulerian formulation", expected="measured coordinates", fix=fix)
-        self.exact, self.equations = exact, checked_equations(equations)
+        self.exact, self.equations = exact, equations or Eulerian()
         self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
         self.controls, self.reduced, self.new_noise = exact.controls, False, exact.new_noise
         self.certified = False
@@ -390,21 +391,3 @@ class EulerianProblem(Objective[EulerianDeformation]):
             return None
         value = float(self.energy(deformation).total)
         return (deformation, value) if value < best else None
-
-
-_NO_CONTROLS = sentence(
-    "the Eulerian formulation has a momentum at every measurement: fewer `controls` are not possible",
-    fix='leave `controls` out, or pass formulation="exact"',
-)
-
-
-def checked_equations(equations: Eulerian | None) -> Eulerian:
-    """``equations``, or the default :class:`Eulerian`.
-
-    Raises:
-        InputError: not an :class:`Eulerian`.
-    """
-    if equations is not None and not isinstance(equations, Eulerian):
-        expected = "an Eulerian(...) of diffeo_calib.paper.eulerian"
-        raise InputError.of("`equations`", expected=expected, got=as_written(equations))
-    return equations or Eulerian()

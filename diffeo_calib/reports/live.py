@@ -13,18 +13,20 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from queue import Queue
-from threading import Condition
+from threading import Condition, Thread
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from diffeo_calib.campaign.campaign import Campaign, Next
-from diffeo_calib.campaign.feeds import DECISIONS, LOCAL, Sent, Server, running
+from diffeo_calib.campaign.feeds import DECISIONS, Inbox
+from diffeo_calib.common.errors import InputError
 
+LOCAL = ("127.0.0.1", "localhost")
 PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500
 """The last rows, and poses."""
@@ -32,7 +34,7 @@ ALIVE_SECONDS = 10.0
 """After this long without news, the page receives a sign of life; closed ones are noticed then."""
 
 
-class Page(Server, HTTPServer):
+class Page(ThreadingHTTPServer):
     """A running server.
 
     Attributes:
@@ -40,7 +42,7 @@ class Page(Server, HTTPServer):
         decisions: what the buttons decided, as programs send it.
     """
 
-    def __init__(self, place: tuple[str, int], decisions: Queue[Sent | None]) -> None:
+    def __init__(self, place: tuple[str, int], decisions: Inbox) -> None:
         super().__init__(place, _Handler)
         host, port = str(self.server_address[0]), self.server_address[1]
         self.token = "" if place[0] in LOCAL else secrets.token_urlsafe()
@@ -60,6 +62,11 @@ class Page(Server, HTTPServer):
             self.closed = True
             self._news.notify_all()
 
+    def handle_error(self, *given: Any) -> None:
+        """A cut connection is no event."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(*given)
+
     def states(self) -> Iterator[str]:
         """Events to show from now on; empty texts in between."""
         seen = -1
@@ -73,7 +80,8 @@ class Page(Server, HTTPServer):
             yield text
 
 
-def served(address: str, decisions: Queue[Sent | None]) -> AbstractContextManager[Page]:
+@contextmanager
+def served(address: str, decisions: Inbox) -> Iterator[Page]:
     """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
 
     Args:
@@ -82,7 +90,21 @@ def served(address: str, decisions: Queue[Sent | None]) -> AbstractContextManage
     Raises:
         InputError: no such address, or one that is taken.
     """
-    return running(lambda place: Page(place, decisions), address, "page")
+    host, _, port = address.rpartition(":")
+    try:
+        page = Page((host or LOCAL[0], int(port)), decisions)
+    except (OSError, ValueError, OverflowError) as error:
+        expected = "a free port, or HOST:PORT"
+        raise InputError.of(f"the page at {address}", expected=expected, got=str(error)) from error
+    thread = Thread(target=page.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield page
+    finally:
+        page.shutdown()
+        page.end()
+        page.server_close()
+        thread.join()
 
 
 def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> dict[str, Any]:
@@ -158,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif not re.fullmatch("[0-9]{1,9}", line):
             self.send_error(400)
         else:
-            self.server.decisions.put(Sent({"do": self._parts.path[1:], "line": int(line)}))
+            self.server.decisions.put({"do": self._parts.path[1:], "line": int(line)})
             self._begin("text/plain")
 
     def log_message(self, *_: object) -> None:

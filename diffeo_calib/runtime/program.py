@@ -61,18 +61,16 @@ class Program:
 
     def points_and_jacobian(self, q: Array, points: Array | None = None) -> tuple[Array, Array]:
         """Points (N, P, 3) [m] and their derivatives (N, P, 3, n) [m/rad or m/m]."""
+        points, on = self._placed(points)
         with _threads(len(q)):
-            return self._points_and_jacobian(q, *self._placed(points))
-
-    def _points_and_jacobian(self, q: Array, points: Array, on: list[int]) -> tuple[Array, Array]:
-        xi, M = self.joint_flow.with_jacobian(q)
-        tips, slopes = self.chain.poses_and_jacobian(xi)
-        tip, slopes = tips[:, on], (slopes @ M[:, None])[:, on]  # (N, P, 4, 4), (N, P, 6, n)
-        arms = (tip[..., :3, :3] @ points[..., None])[..., 0]  # (N, P, 3)
-        turned = cross(slopes[:, :, 3:].swapaxes(2, 3), arms[:, :, None])  # (N, P, n, 3)
-        placed = slopes[:, :, :3] + turned.swapaxes(2, 3)
-        moved, bent = self.task_flow.with_jacobian((arms + tip[..., :3, 3]).reshape(-1, 3))
-        return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
+            xi, M = self.joint_flow.with_jacobian(q)
+            tips, slopes = self.chain.poses_and_jacobian(xi)
+            tip, slopes = tips[:, on], (slopes @ M[:, None])[:, on]  # (N, P, 4, 4), (N, P, 6, n)
+            arms = (tip[..., :3, :3] @ points[..., None])[..., 0]  # (N, P, 3)
+            turned = cross(slopes[:, :, 3:].swapaxes(2, 3), arms[:, :, None])  # (N, P, n, 3)
+            placed = slopes[:, :, :3] + turned.swapaxes(2, 3)
+            moved, bent = self.task_flow.with_jacobian((arms + tip[..., :3, 3]).reshape(-1, 3))
+            return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
 
     def poses(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> Array:
         """Poses of a tool by three points around it.

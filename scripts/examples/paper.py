@@ -9,8 +9,15 @@ comparison: it has no `predict` and cannot be saved.
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "paper_arm"))  # for section 5 and its listings
+
+from listings import Descent, evaluate, lr_calibration
+from section_5 import section_5
+
 import diffeo_calib as dc
-from diffeo_calib.paper.figures import Descent, evaluate, lr_calibration, section_5
 
 
 def main() -> None:
@@ -23,7 +30,7 @@ def main() -> None:
     for name, fit in {"exact": exact, "eulerian": corrected, "printed sign of (11), (17)": printed}.items():
         print(f"{name:28} energy (16) {fit.energy:.5f} after {fit.evaluations} evaluations: {fit.status}")
 
-    # Listings 1 and 2, to be read beside diffeo_calib/paper/figures.py.
+    # Listings 1 and 2, to be read beside benchmarks/paper_arm/listings.py.
     k0, K_V, K_W = problem.spec.nominal, problem.spec.joint_kernel, problem.spec.task_kernel
     found = lr_calibration(problem.x, problem.y, k0, K_V, K_W, 0.01, Descent(mu=3e-10, epsilon=1.0, max_iter=20))
     k1, Dk1 = evaluate(problem.x[:5], *found)

@@ -1,21 +1,16 @@
-"""A script for a robot of Universal Robots and a laser tracker that feeds a campaign over a socket, pose by pose.
+"""A script for a robot of Universal Robots and a laser tracker that feeds a campaign through a pipe, pose by pose.
 
     python scripts/examples/ur_tracker_campaign.py
 
-The campaign runs in a process of its own, usually in another terminal:
-
-    diffeo-calib campaign campaign.toml --listen 5000 --target 0.3mm --page 8000
-
-This script moves the robot to the pose that the campaign proposes, measures, sends the row and prints the verdict; a
-row that looks wrong is measured again. Where the connection is cut it connects again and sends the row once more: its
-id says that it is the same. Robot and tracker are simulated; their real calls stand beside. The lines that are sent
-and answered are described in diffeo_calib/campaign/feeds.py.
+This script starts the campaign, moves the robot to the pose that it proposes, measures, sends the row and prints the
+verdict; a row that looks wrong is measured again. With `--page 8000` among the campaign's words, a browser shows it.
+Robot and tracker are simulated; their real calls stand beside. The lines that are sent and answered are described in
+diffeo_calib/campaign/feeds.py.
 """
 
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -71,26 +66,18 @@ class Tracker:
 
 
 class Feed:
-    """The connection to a campaign at HOST:PORT."""
+    """The pipes to a campaign."""
 
-    def __init__(self, address: str) -> None:
-        self.place = (address.rpartition(":")[0], int(address.rpartition(":")[2]))
-        self.lines: Any = None
+    def __init__(self, campaign: subprocess.Popen[str]) -> None:
+        self.campaign = campaign
 
     def send(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Send an object until it is answered."""
-        while True:
-            try:
-                if self.lines is None:
-                    with socket.create_connection(self.place, timeout=60) as connection:
-                        self.lines = connection.makefile("rw", encoding="utf-8")
-                    self.lines.readline()  # how the campaign is
-                self.lines.write(json.dumps(row) + "\n")
-                self.lines.flush()
-                return json.loads(self.lines.readline())
-            except (OSError, ValueError):
-                self.lines = None
-                time.sleep(0.5)
+        """Send an object; the answer."""
+        assert self.campaign.stdin is not None
+        assert self.campaign.stdout is not None
+        self.campaign.stdin.write(json.dumps(row) + "\n")
+        self.campaign.stdin.flush()
+        return json.loads(self.campaign.stdout.readline())
 
 
 def measured(feed: Feed, robot: Robot, tracker: Tracker, number: int) -> dict[str, Any]:
@@ -105,10 +92,10 @@ def main() -> None:
     arm = SimulatedArm(seed=3)
     arm.write_urdf("robot.urdf")
     Path("campaign.toml").write_text(CAMPAIGN)
-    words = ["campaign", "campaign.toml", "--listen", "0", "--target", "0.3mm", "--json-lines"]
-    with subprocess.Popen([sys.executable, "-m", "diffeo_calib", *words], stdout=subprocess.PIPE) as campaign:
-        assert campaign.stdout is not None
-        robot, feed = Robot(arm), Feed(json.loads(campaign.stdout.readline())["listening"])
+    words = ["campaign", "campaign.toml", "--stdin", "--target", "0.3mm", "--json-lines"]
+    command = [sys.executable, "-m", "diffeo_calib", *words]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as campaign:
+        robot, feed = Robot(arm), Feed(campaign)
         tracker, answer = Tracker(robot), feed.send({})
         number = answer["rows"]  # a program that starts again counts on
         first = [dict(zip(arm.nominal.joint_names, q, strict=True)) for q in arm.sample(FIRST_POSES).rad2deg().tolist()]
@@ -123,7 +110,6 @@ def main() -> None:
                 answer = measured(feed, robot, tracker, number)
                 number += 1
         print(f"{answer['accepted_rows']} of {answer['rows']} rows, {answer['expected_error_mm']:.2f} mm expected")
-        feed.lines.close()
         campaign.communicate()
 
 

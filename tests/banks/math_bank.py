@@ -12,6 +12,7 @@ from itertools import pairwise
 from math import log2, sqrt
 
 import torch
+from section_5 import SIGMA, section_5, section_5_kernels
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -20,7 +21,6 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.paper.figures import SECTION_5_SIGMA, section_5, section_5_kernels
 from diffeo_calib.robots import elastic_rr
 
 Kappa = Callable[[Tensor], Tensor]
@@ -299,7 +299,7 @@ def slopes(errors: list[float]) -> list[float]:
 K_V, K_W = section_5_kernels()
 
 
-def rr_problem(k: int, noise: float = SECTION_5_SIGMA) -> Problem:
+def rr_problem(k: int, noise: float = SIGMA) -> Problem:
     """The paper's test bed on a k x k grid."""
     return section_5(noise, k)
 

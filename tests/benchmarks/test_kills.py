@@ -44,7 +44,7 @@ def test_killed_commands_leave_whole_files(records: dict[str, Any]) -> None:
 
 
 def test_campaigns_under_faults_lose_no_row(records: dict[str, Any]) -> None:
-    faults = ["kill", "full disk", "cut socket", "half a line", "two writers"]
+    faults = ["kill", "full disk", "cut pipe", "half a line", "two writers"]
     assert [record["fault"] for record in records["campaign_faults"]] == faults
     assert sum(record["faults"] for record in records["campaign_faults"]) >= 3  # two may come too late
     for record in records["campaign_faults"]:

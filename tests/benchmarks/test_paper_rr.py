@@ -10,10 +10,10 @@ import rr_bed
 import torch
 from harness import Record, Value
 from paper_rr import Case, at_the_border, attempt, cases, measure
+from section_5 import section_5
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 FIELDS = {

@@ -24,12 +24,3 @@ def test_demo(command: Command, tmp_path: Path) -> None:
     again = command(*arguments[: arguments.index("--figure")])  # figure and report are those of the demo
     assert again.code == 0
     assert again.numbers("calibrated", "held out") == done.numbers("calibrated", "held out")
-
-
-@pytest.mark.slow
-def test_demo_of_the_paper(command: Command, tmp_path: Path) -> None:
-    done = command("demo", "--paper", "--output", tmp_path / "paper")
-    assert (done.code, done.err.strip()) == (0, "")
-    assert "energy (16) 5.696" in done.out
-    assert "5.07 orders of magnitude less" in done.out
-    assert len(list((tmp_path / "paper").glob("figure_*.png"))) == 5

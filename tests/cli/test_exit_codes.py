@@ -50,14 +50,6 @@ def test_wrong_usage_is_exit_2(arguments: list[str], command: Command) -> None:
     assert "Usage" in done.err
 
 
-@pytest.mark.parametrize("option", ["--rows", "--seed"])
-def test_options_of_the_other_demo_are_refused(option: str, command: Command, tmp_path: Path) -> None:
-    done = command("demo", "--paper", option, 30, "-o", tmp_path / "new")
-    assert done.code == 1
-    assert "belong to the simulated arm" in done.error
-    assert not (tmp_path / "new").exists()
-
-
 def test_unconverged_is_exit_3_with_the_model_written(
     site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,8 +59,6 @@ OPTIONS = {
             "--payload",
             "--target",
             "--stdin",
-            "--listen",
-            "--token",
             "--json-lines",
             "--bag",
             "--seen",
@@ -172,7 +170,7 @@ OPTIONS = {
         ),
         *("--title", "--against", "--tolerance"),
     ],
-    "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
+    "demo": ["-o", "--output", "--rows", "--seed"],
 }
 for _options in OPTIONS.values():
     _options.append("--json")

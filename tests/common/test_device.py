@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from math_bank import CASES, Case
+from section_5 import section_5
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg  # noqa: F401  # its OpenBLAS is known only once it is loaded
 import torch
 from math_bank import torch_threads
+from section_5 import section_5
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import diffeo_calib as dc
@@ -22,7 +23,6 @@ from diffeo_calib.common.threads import (
     small_work,
     torch_alone,
 )
-from diffeo_calib.paper.figures import section_5
 
 
 def counts() -> list[int]:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from fit_bank import Offset, deformed, noise_blocks
 from math_bank import K_V, K_W, circle, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
+from section_5 import section_5
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -14,7 +15,6 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.objective import tangent
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.paper.figures import section_5
 from diffeo_calib.robots import elastic_rr
 
 

@@ -21,11 +21,12 @@ from diffeo_calib.kernels.reductions.distributed import LostRankError, Ranks
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, Formula
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
+ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("distributed_program.py")
 ENVIRONMENT = {
     **os.environ,
     "OMP_NUM_THREADS": "1",
-    "PYTHONPATH": os.pathsep.join([str(PROGRAM.parents[2]), str(PROGRAM.parents[1] / "banks")]),
+    "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("", "tests/banks", "benchmarks/paper_arm")),
 }
 PATIENCE = 280.0
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from math_bank import normal
+from section_5 import section_5, section_5_kernels
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.paper.figures import section_5, section_5_kernels
 
 
 class Skewed(Kernel):

@@ -9,22 +9,20 @@ import numpy as np
 import pytest
 import torch
 from image_bank import png_size
-from matplotlib.figure import Figure
-from torch import Tensor
-
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.paper import figures
-from diffeo_calib.paper.figures import (
+from paper_figures import (
     POSES,
     heat_maps_figure,
     histogram_figure,
-    mean_error,
+    main,
     paper_figures,
     poses_figure,
-    random_configurations,
     surfaces_figure,
     workspaces_figure,
 )
+from rr_bed import held_out
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
 GAIN = 1e-6
@@ -37,7 +35,7 @@ def model(x: Tensor) -> Tensor:
 
 def log_errors() -> np.ndarray:
     """log10 of the nominal errors at the random configurations: (3000,)."""
-    x = random_configurations()
+    x = held_out()
     return (elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1).log10().numpy()
 
 
@@ -47,16 +45,10 @@ def curve(line: Any) -> np.ndarray:
 
 
 def test_random_configurations_cover_the_torus() -> None:
-    x = random_configurations()
+    x = held_out()
     assert x.shape == (3000, 2)
     assert 3.1 < float(x.abs().max()) <= torch.pi
-    assert torch.equal(x, random_configurations())
-
-
-def test_mean_error() -> None:
-    assert mean_error(model) == pytest.approx(GAIN * mean_error(elastic_rr.nominal), rel=1e-6)
-    assert mean_error(elastic_rr.nominal) == pytest.approx((10 ** log_errors()).mean(), rel=1e-12)
-    assert mean_error(elastic_rr.real) == 0.0
+    assert torch.equal(x, held_out())
 
 
 def test_poses_show_both_arms() -> None:
@@ -104,7 +96,7 @@ def test_workspaces_are_images_of_one_grid() -> None:
 def test_heat_maps_show_every_error_where_the_tip_is() -> None:
     axes = [a for a in heat_maps_figure(model).axes if a.get_title()]
     assert [a.get_title() for a in axes] == ["nominal (figure 10)", "calibrated (figure 11)"]
-    expected, real = log_errors(), elastic_rr.real(random_configurations()).numpy()
+    expected, real = log_errors(), elastic_rr.real(held_out()).numpy()
     order = np.argsort(expected)
     for panel, shift in zip(axes, (0.0, -6.0), strict=True):
         (scatter,) = panel.collections
@@ -126,26 +118,23 @@ def test_histograms_count_every_configuration() -> None:
 
 
 @pytest.mark.slow
-def test_every_figure_is_written(tmp_path: Path) -> None:
-    paths = paper_figures(model, tmp_path)
-    assert [path.name.split("_")[1] for path in paths] == ["04", "06", "08", "10", "12"]
-    assert sorted(paths) == sorted(tmp_path.iterdir())
-    for path in paths:
-        assert min(png_size(path)) >= 600
-
-
-@pytest.mark.slow
 def test_an_exact_model_has_no_logarithm_of_zero(tmp_path: Path) -> None:
     assert len(paper_figures(elastic_rr.real, tmp_path)) == 5
-
-
-def test_other_formats_and_folders_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "DRAWINGS", {"one": lambda model: Figure()})
-    assert paper_figures(elastic_rr.real, str(tmp_path), ".pdf")[0].read_bytes()[:4] == b"%PDF"
-    with pytest.raises(InputError, match=r"`suffix`: expected .png, .pdf, .svg, got '.gif'"):
-        paper_figures(elastic_rr.real, tmp_path, ".gif")
 
 
 def test_a_folder_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"folder of figures.*expected an existing folder"):
         paper_figures(torch.zeros_like, tmp_path / "none")
+
+
+@pytest.mark.slow
+def test_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["paper_figures.py", "--out", str(tmp_path)])
+    main()
+    printed = capsys.readouterr().out
+    assert "energy (16) 5.696" in printed
+    assert "5.07 orders of magnitude less" in printed
+    paths = sorted(tmp_path.iterdir())
+    assert [path.name.split("_")[1] for path in paths] == ["04", "06", "08", "10", "12"]
+    for path in paths:
+        assert min(png_size(path)) >= 600

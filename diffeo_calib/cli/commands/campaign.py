@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from itertools import chain
-from queue import Empty, Queue
+from queue import Empty
 from threading import Thread
 
 import typer
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import ID, Listener, Sent, listening, read_lines
+from diffeo_calib.campaign.feeds import ID, Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
@@ -33,8 +33,6 @@ JOURNAL = ".journal"
 """Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
 
-Inbox = Queue[Sent | None]
-
 
 def run(links: Robot, source: MeasuredTable, given: LiveOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
@@ -49,17 +47,15 @@ def run(links: Robot, source: MeasuredTable, given: LiveOptions) -> None:
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
         live = Live(campaign, source, links.tip, journal, given)
         live.resume()
-        inbox: Inbox = Queue()  # a SimpleQueue can wait for ever after a signal
+        inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
-        listener = None if given.listen is None else stack.enter_context(listening(given.listen, given.token, inbox))
-        for where, face in (("shown", page and page.url), ("listening", listener and listener.address)):
-            if face is not None:
-                live.say(f"the campaign is {where} at {face}", {where: face})
+        if page is not None:
+            live.say(f"the campaign is shown at {page.url}", {"shown": page.url})
         if given.bag is not None:
             left = [row for row in played if live.known(row) is None]
             Thread(target=play, args=(left, inbox, given.speed), daemon=True).start()
         code = _followed(live, given, inbox, page)
-        _end(live, listener)
+        _end(live)
     if given.accepted is not None:
         numbers = dict.fromkeys(live.owner[row] for row in campaign.accepted)
         write_whole(given.accepted, live.table.header + b"".join(live.lines[number] for number in numbers))
@@ -89,7 +85,7 @@ def play(
     begin = time.monotonic() - rows[0]["time"] / speed if rows else 0.0
     for row in rows:
         sleep(max(begin + row["time"] / speed - time.monotonic(), 0.0))
-        inbox.put(Sent(row))
+        inbox.put(row)
     inbox.put(None)
 
 
@@ -125,18 +121,15 @@ def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
         except Empty:
             yield live.poll()
             continue
-        if sent is not None:
-            live.take(sent)
-            yield True
-        elif given.listen is None:
+        if sent is None:
             return
+        live.take(sent)
+        yield True
 
 
-def _end(live: Live, listener: Listener | None) -> None:
+def _end(live: Live) -> None:
     """Say how a campaign ended."""
     state = live.state() | {"ended": True}
-    if listener is not None:
-        listener.last = state
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
     later = live.ignored + len(live.new_lines())

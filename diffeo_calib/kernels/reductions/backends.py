@@ -146,8 +146,9 @@ def evaluate(
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
-    if accuracy is not None and name != "dense" and not followed and _finite(at, columns):
-        found = fourier.sums(formula, profile, *_centred(rows, columns), accuracy)
+    if accuracy is not None and name != "dense" and not followed:
+        finite = (at.features.sum() + columns.features.sum()).isfinite()  # a flow that diverges has no extent
+        found = fourier.sums(formula, profile, *_centred(rows, columns), accuracy) if bool(finite) else None
         if found is not None:
             return found
     try:
@@ -155,14 +156,9 @@ def evaluate(
             formula, profile, *(rows, columns) if name == "fused" else _centred(rows, columns)
         )
     except keops.KeopsUnavailableError as error:
-        keops.warn(error)
+        keops.warn(str(error))
         found = None
     return found or Tiled().reduce(formula, profile, *_centred(rows, columns))
-
-
-def _finite(rows: Points, columns: Points) -> bool:
-    """Whether all points are finite. Those of a flow that diverges have no extent; exact sums then return NaN."""
-    return bool((rows.features.sum() + columns.features.sum()).isfinite())
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:

@@ -175,7 +175,7 @@ class Distributed:
             compiled = FUSED.program(formula, profile, rows, columns)
             if compiled is not None:
                 (totals,) = together.total([compiled.totals(rows, columns, together.mine)])
-                return compiled.results(totals, len(at.features), at.features.dtype)
+                return compiled.results(totals, len(at.features))
             return formula.finish(together.total(self.tiles.share(formula, profile, rows, columns, together.mine)), at)
 
 

@@ -200,9 +200,9 @@ class Unknown:
 
 
 class MatrixPairs:
-    """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd."""
+    """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd; all of them are dot products."""
 
-    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+    def dot(self, a: Tensor, b: Tensor) -> Any:
         """a_i . b_j: (M, k), (N, k) -> (M, N)."""
         return a @ b.T
 
@@ -210,26 +210,17 @@ class MatrixPairs:
         """Vectors one after the other: (M, k), (M, l) -> (M, k + l)."""
         return torch.cat([a, b], -1)
 
-    def squared_distance(self, e: Tensor, f: Tensor) -> Tensor:
+    def squared_distance(self, e: Tensor, f: Tensor) -> Any:
         """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
-        return self.dot(*distance_factors(e, f))
+        e2, f2 = _dots(e, e), _dots(f, f)
+        left = torch.cat([-2.0 * e, e2, torch.ones_like(e2)], -1)  # (M, D + 2)
+        return self.dot(left, torch.cat([f, torch.ones_like(f2), f2], -1))
 
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Tensor:
+    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Any:
         """2 (e_i - f_j) . (de_i - df_j), the derivative of the squared distance: (M, N)."""
-        return self.dot(*distance_change_factors(e, de, f, df))
-
-
-def distance_factors(e: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:
-    """Vectors (M, D + 2), (N, D + 2) whose dot products are |e_i - f_j|^2."""
-    e2, f2 = _dots(e, e), _dots(f, f)
-    return torch.cat([-2.0 * e, e2, torch.ones_like(e2)], -1), torch.cat([f, torch.ones_like(f2), f2], -1)
-
-
-def distance_change_factors(e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> tuple[Tensor, Tensor]:
-    """Vectors (M, 2 D + 2), (N, 2 D + 2) whose dot products are 2 (e_i - f_j) . (de_i - df_j)."""
-    ee, ff = 2.0 * _dots(e, de), 2.0 * _dots(f, df)
-    left = torch.cat([-2.0 * e, -2.0 * de, ee, torch.ones_like(ee)], -1)
-    return left, torch.cat([df, f, torch.ones_like(ff), ff], -1)
+        ee, ff = 2.0 * _dots(e, de), 2.0 * _dots(f, df)
+        left = torch.cat([-2.0 * e, -2.0 * de, ee, torch.ones_like(ee)], -1)  # (M, 2 D + 2)
+        return self.dot(left, torch.cat([df, f, torch.ones_like(ff), ff], -1))
 
 
 def _dots(a: Tensor, b: Tensor) -> Tensor:

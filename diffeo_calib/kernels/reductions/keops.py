@@ -167,19 +167,19 @@ def available() -> bool:
     try:
         load()
     except KeopsUnavailableError as error:
-        warn(error)
+        warn(str(error))
         return False
     return True
+
+
+def warn(reason: str) -> None:
+    """Warn, once per reason, that the fallback runs."""
+    _warned(f"{reason} Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers.")
 
 
 @cache
 def _warned(text: str) -> None:
     warnings.warn(text, DiffeoCalibWarning, stacklevel=2)  # not warn_user: models do not record it
-
-
-def warn(error: KeopsUnavailableError) -> None:
-    """Warn, once per reason, that the fallback runs."""
-    _warned(f"{error} Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers.")
 
 
 def cache_folder(name: str) -> Path:

@@ -25,15 +25,7 @@ from torch import Tensor
 
 from diffeo_calib.common.threads import in_parallel, small_work
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import (
-    Formula,
-    MatrixPairs,
-    Points,
-    Unknown,
-    distance_change_factors,
-    distance_factors,
-    weighted_sums,
-)
+from diffeo_calib.kernels.reductions.formulas import Formula, MatrixPairs, Points, Unknown, weighted_sums
 
 CPU_ELEMENTS = 1 << 18
 """Pairs in a tile: 2 MiB in float64. Its operations last so long that Python's own time is small, and that threads wait
@@ -304,7 +296,11 @@ class Symbol(Unknown):
 
     def __add__(self, other: Symbol | float) -> Symbol:
         if self.scale == 0.0:
-            return self._constant(other) if not isinstance(other, Symbol) else other
+            if isinstance(other, Symbol):
+                return other
+            out = Matrix(self.pool, *self.matrix.shape)
+            out.values.fill_(other)
+            return Symbol(self.pool, 1.0, out)
         a, out = self._fresh()
         if isinstance(other, Symbol):
             torch.add(a, other.matrix, alpha=other.scale / self.scale, out=out.values)
@@ -355,11 +351,6 @@ class Symbol(Unknown):
         if self.scale <= 0.0:
             raise RuntimeError("sqrt and relu of a negative multiple are not implemented: no profile needs them")
 
-    def _constant(self, value: float) -> Symbol:
-        out = Matrix(self.pool, *self.matrix.shape)
-        out.values.fill_(value)
-        return Symbol(self.pool, 1.0, out)
-
 
 @cache
 def powers_of_two_are_faster(device: str, dtype: torch.dtype) -> bool:
@@ -376,7 +367,7 @@ def powers_of_two_are_faster(device: str, dtype: torch.dtype) -> bool:
     return seconds[torch.exp2] < CLEARLY_LESS * seconds[torch.exp]
 
 
-class PooledPairs:
+class PooledPairs(MatrixPairs):
     """Pairwise symbols as pooled matrices."""
 
     def __init__(self, pool: Pool) -> None:
@@ -385,18 +376,6 @@ class PooledPairs:
     def dot(self, a: Tensor, b: Tensor) -> Symbol:
         """a_i . b_j: (M, k), (N, k) -> (M, N)."""
         return Symbol(self.pool, 1.0, factors=(a, b))
-
-    def joined(self, a: Tensor, b: Tensor) -> Tensor:
-        """Vectors one after the other."""
-        return torch.cat([a, b], -1)
-
-    def squared_distance(self, e: Tensor, f: Tensor) -> Symbol:
-        """|e_i - f_j|^2 to rounding: (M, D), (N, D) -> (M, N)."""
-        return self.dot(*distance_factors(e, f))
-
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Symbol:
-        """2 (e_i - f_j) . (de_i - df_j): (M, N)."""
-        return self.dot(*distance_change_factors(e, de, f, df))
 
 
 class _Pools(threading.local):

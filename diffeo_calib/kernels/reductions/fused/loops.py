@@ -34,7 +34,7 @@ class Program:
 
     Args:
         inputs: names of the fields of :class:`Points` that are read, and the number of their coordinates.
-        vector: the type of pairwise scalars; sums are doubles.
+        vector: the type of pairwise scalars.
     """
 
     formula: Formula
@@ -75,7 +75,7 @@ class Program:
             TypeError, AttributeError: the profile uses other operations than those of :class:`Symbol`.
         """
         plain, mirrored = _Block(self, mirrored=False), _Block(self, mirrored=True)
-        declared = DECLARATIONS.format(v=self.vector, suffix=self.vector.suffix, real=self.vector.real)
+        declared = DECLARATIONS.format(v=self.vector, suffix=self.vector.suffix)
         drivers = DRIVERS.format(rows=self.rows, group=self.group)
         text = "\n".join([declared, plain.text("plain"), mirrored.text("mirrored"), drivers])
         return text, [result.factor for result in plain.results]
@@ -208,24 +208,22 @@ class _Block:
             place += size
         return Points(**found)
 
-    def _address(self, code: Code, k: int, place: _Place, kind: str) -> str:
+    def _address(self, code: Code, k: int, place: _Place) -> str:
         """Of the number at a point in the k-th line of an array."""
         number = code.value(f"add i64 {code.value(f'mul i64 {place.length}, {k}')}, {place.point}")
-        return code.value(f"getelementptr {kind}, ptr {place.array}, i64 {number}")
+        return code.value(f"getelementptr double, ptr {place.array}, i64 {number}")
 
     def _spread(self, k: int, at: str) -> str:
         """An input of a row, in all lanes."""
-        code, v, real = self.head, self.vector, self.vector.real
-        number = code.value(f"load {real}, ptr {self._address(code, k, _Place('%rows', '%m', at), real)}")
-        first = code.value(f"insertelement {v} poison, {real} {number}, i32 0")
+        code, v = self.head, self.vector
+        number = code.value(f"load double, ptr {self._address(code, k, _Place('%rows', '%m', at))}")
+        first = code.value(f"insertelement {v} poison, double {number}, i32 0")
         return code.value(f"shufflevector {v} {first}, {v} poison, <{v.lanes} x i32> zeroinitializer")
 
     def _column(self, k: int) -> str:
         """An input of the columns."""
-        code, real = self.loop, self.vector.real
-        return code.value(
-            f"load {self.vector}, ptr {self._address(code, k, _Place('%columns', '%n', '%j'), real)}, align 4"
-        )
+        address = self._address(self.loop, k, _Place("%columns", "%n", "%j"))
+        return self.loop.value(f"load {self.vector}, ptr {address}, align 8")
 
     def _products(self, term: Term, weight: Symbol, i: Points, j: Points) -> list[tuple[Factors, Factors]]:
         """Factors of what a term adds to each sum of a row, and to the column's, but for the sign of differences."""
@@ -241,23 +239,16 @@ class _Block:
         return [((a, d), (b, d)) for a, b in zip(ours, theirs, strict=True) for d in apart]
 
     def _store_shares(self, result: _Result) -> None:
-        code, wide = self.loop, Vector("double", self.vector.lanes)
         for k in result.places if result.terms else ():
-            share = self.shares[k]
-            if self.vector != wide:
-                share = code.value(f"fpext {self.vector} {share} to {wide}")
-            address = self._address(code, k, _Place("%out", "%n", "%j"), "double")
-            self._accumulate(code, wide, address, share, "fsub" if result.odd else "fadd")
+            address = self._address(self.loop, k, _Place("%out", "%n", "%j"))
+            self._accumulate(self.loop, self.vector, address, self.shares[k], "fsub" if result.odd else "fadd")
 
     def _store_sums(self, r: int, sums: list[str]) -> None:
-        code, v, real = self.tail, self.vector, self.vector.real
+        code, v = self.tail, self.vector
         for k in [k for result in self.results if result.terms for k in result.places]:
-            total = code.value(f"call reassoc {real} @llvm.vector.reduce.fadd.{v.suffix}({real} 0.0, {v} {sums[k]})")
-            if real != "double":
-                total = code.value(f"fpext {real} {total} to double")
-            self._accumulate(
-                code, "double", self._address(code, k, _Place("%out", "%m", f"%i{r}"), "double"), total, "fadd"
-            )
+            total = code.value(f"call reassoc double @llvm.vector.reduce.fadd.{v.suffix}(double 0.0, {v} {sums[k]})")
+            address = self._address(code, k, _Place("%out", "%m", f"%i{r}"))
+            self._accumulate(code, "double", address, total, "fadd")
 
     def _accumulate(self, code: Code, kind: object, address: str, number: str, operation: str) -> None:
         old, new = code.name(), code.name()
@@ -271,7 +262,7 @@ class _Block:
 DECLARATIONS = """
 declare {v} @llvm.fmuladd.{suffix}({v}, {v}, {v})
 declare {v} @llvm.sqrt.{suffix}({v})
-declare {real} @llvm.vector.reduce.fadd.{suffix}({real}, {v})
+declare double @llvm.vector.reduce.fadd.{suffix}(double, {v})
 declare i64 @llvm.smin.i64(i64, i64)
 attributes #0 = {{ nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" "no-stack-arg-probe" }}
 """

@@ -11,7 +11,6 @@ import ctypes
 import hashlib
 import os
 import sys
-import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
@@ -24,14 +23,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import SHIPPED, Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program, SymbolicPairs
 from diffeo_calib.kernels.reductions.fused.symbols import Code, Vector
-from diffeo_calib.kernels.reductions.keops import cache_folder
+from diffeo_calib.kernels.reductions.keops import cache_folder, warn
 from diffeo_calib.kernels.reductions.tiled import LARGE_PAIRS, PARTS, SHARED_PARTS, dealt
 
 DIGEST = hashlib.sha256().digest_size
@@ -128,8 +127,6 @@ def _kept(mark: str) -> bytes | None:
 
 
 Chosen = Callable[[Sequence[Any]], list[Any]]
-REALS = {torch.float64: ("double", 8), torch.float32: ("float", 4)}
-"""Types of points: their names, and bytes of a number."""
 TILE_BYTES = 20 << 10
 """Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
 CACHE_LINE = 64
@@ -181,12 +178,12 @@ class Compiled(NamedTuple):
 
         Args:
             rows: the M points at which sums are evaluated; None for the columns themselves.
-            columns: the N points of the sum. All may be single, which halves the time; the totals are double.
+            columns: the N points of the sum.
             mine: chooses from tiles of rows those of this process.
         """
         at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
         large = len(at.features) * right.count >= LARGE_PAIRS
-        sizes = right.values.element_size() * sum(self.program.sizes.values()) + 8 * self.program.count
+        sizes = 8 * (sum(self.program.sizes.values()) + self.program.count)  # bytes of a column
         side = max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)  # points, a power of two
         if rows is None:
             tiles = mine(range(-(-right.count // side)))
@@ -207,14 +204,14 @@ class Compiled(NamedTuple):
             pass
         return totals
 
-    def results(self, totals: Tensor, rows: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+    def results(self, totals: Tensor, rows: int) -> tuple[Tensor, ...]:
         """The results of the formula at M rows, from all sums."""
         found, first = [], 0
         for size, factor, (term, *_) in zip(
             self.program.outputs, self.factors, self.program.formula.results, strict=True
         ):
             total = totals[first : first + size, :rows]
-            result = (total if factor == 1.0 else total * factor).to(dtype).T
+            result = (total if factor == 1.0 else total * factor).T
             found.append(
                 result.unflatten(1, (self.program.sizes["momenta"], -1)) if term.vector and term.apart else result
             )
@@ -254,29 +251,26 @@ class Fused:
     def usable(self) -> bool:
         """Whether the backend is expected to work on this machine; warns once if not."""
         if not self.available():
-            _warn(_reason() or "LLVM has failed")
+            warn(f"{_reason() or 'LLVM has failed'}.")
         return self.available()
 
     def program(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> Compiled | None:
         """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
-        dtype = columns.features.dtype
-        alike = all(t.dtype == dtype and t.device.type == "cpu" for t in (*(rows or ()), *columns) if t is not None)
-        if dtype not in REALS or not alike or not self.available():
+        tensors = [t for t in (*(rows or ()), *columns) if t is not None]
+        fitting = all(t.dtype == torch.float64 and t.device.type == "cpu" for t in tensors)
+        if not fitting or not self.available():
             return None
         inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
         try:
-            key = (formula, profile if type(profile) in SHIPPED else _instructions(formula, profile), dtype, inputs)
+            key = (formula, profile if type(profile) in SHIPPED else _instructions(formula, profile), inputs)
             if key not in self._programs:
-                self._programs[key] = self._compiled(formula, profile, inputs, dtype)
+                self._programs[key] = self._compiled(formula, profile, inputs)
         except Exception:  # a profile of the user may raise anything where it gets symbols, and works with tensors
             return None
         return self._programs[key]
 
-    def _compiled(
-        self, formula: Formula, profile: Profile, inputs: tuple[tuple[str, int], ...], dtype: torch.dtype
-    ) -> Compiled | None:
-        real, size = REALS[dtype]
-        program = Program(formula, profile, inputs, Vector(real, machine().vector_bytes // size))
+    def _compiled(self, formula: Formula, profile: Profile, inputs: tuple[tuple[str, int], ...]) -> Compiled | None:
+        program = Program(formula, profile, inputs, Vector(machine().vector_bytes // 8))
         if program.count > MOST_OUTPUTS or sum(program.sizes.values()) > MOST_INPUTS:
             return None
         if type(profile) not in SHIPPED:
@@ -288,7 +282,7 @@ class Fused:
             return Compiled(program, factors, *machine().functions(text, LOOPS))
         except Exception as error:  # LLVM may raise anything
             self.failed = True
-            _warn(f"LLVM could not compile a kernel sum ({error})")
+            warn(f"LLVM could not compile a kernel sum ({error}).")
             return None
 
     def reduce(
@@ -299,7 +293,7 @@ class Fused:
         if compiled is None:
             return None
         at = columns if rows is None else rows
-        return compiled.results(compiled.totals(rows, columns), len(at.features), at.features.dtype)
+        return compiled.results(compiled.totals(rows, columns), len(at.features))
 
 
 FUSED = Fused()
@@ -313,7 +307,7 @@ def _numbers(tiles: tuple[int, ...]) -> Tensor:
 
 def _instructions(formula: Formula, profile: Profile) -> Hashable:
     """Compiled form of a formula with a profile, whose constants may change between calls."""
-    code, sides = Code(Vector("double", 1), count()), (Points(*([f"%{side}{k}"] for k in range(4))) for side in "ij")
+    code, sides = Code(Vector(1), count()), (Points(*([f"%{side}{k}"] for k in range(4))) for side in "ij")
     weights = formula.weights(SymbolicPairs(code), profile, *sides)
     return (*code.lines, *((w.value, w.scale) for w in weights))
 
@@ -328,9 +322,3 @@ def _reason() -> str | None:
     except Exception as error:  # LLVM may raise anything
         return f"LLVM does not know this processor ({error})"
     return None
-
-
-@cache
-def _warn(reason: str) -> None:
-    text = f"{reason}. Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=2)

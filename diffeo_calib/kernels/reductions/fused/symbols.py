@@ -16,53 +16,37 @@ from diffeo_calib.kernels.reductions.formulas import Unknown
 
 MOST_FACTORS = 8
 """Of a power in a profile."""
-EXP2 = {
-    "double": (
-        1.0,
-        0.6931471805599516,
-        0.24022650695910472,
-        0.05550410866434658,
-        0.009618129107380715,
-        0.001333355824648072,
-        0.00015403530800818256,
-        1.525264774769592e-05,
-        1.321523563477604e-06,
-        1.0210506458816145e-07,
-        7.111758687557852e-09,
-    ),
-    "float": (
-        1.0,
-        0.6931472149680279,
-        0.24022652782887738,
-        0.05550310551013797,
-        0.009617692972993062,
-        0.0013406643902351759,
-        0.0001559467816132662,
-    ),
-}
-"""Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16 and 3e-9."""
-EXPONENTS = {"double": (1023, 52, 64), "float": (127, 23, 32)}
-"""Bias of the exponent, bits of the fraction, bits of a number."""
+EXP2 = (
+    1.0,
+    0.6931471805599516,
+    0.24022650695910472,
+    0.05550410866434658,
+    0.009618129107380715,
+    0.001333355824648072,
+    0.00015403530800818256,
+    1.525264774769592e-05,
+    1.321523563477604e-06,
+    1.0210506458816145e-07,
+    7.111758687557852e-09,
+)
+"""Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16."""
+BIAS, FRACTION_BITS = 1023, 52
+"""Of a double."""
 
 
 @dataclass(frozen=True)
 class Vector:
-    """The type of a vector.
+    """The type of a vector of so many doubles."""
 
-    Args:
-        real: "double" or "float". lanes: numbers in it.
-    """
-
-    real: str
     lanes: int
 
     def __str__(self) -> str:
-        return f"<{self.lanes} x {self.real}>"
+        return f"<{self.lanes} x double>"
 
     @property
     def suffix(self) -> str:
         """Of the names of functions of such vectors."""
-        return f"v{self.lanes}f{64 if self.real == 'double' else 32}"
+        return f"v{self.lanes}f64"
 
 
 class Code:
@@ -90,9 +74,7 @@ class Code:
 
     def constant(self, number: float) -> str:
         """A vector of equal numbers."""
-        if self.vector.real == "float":
-            number = struct.unpack("f", struct.pack("f", number))[0]
-        bits = f"{self.vector.real} 0x{struct.pack('>d', number).hex().upper()}"
+        bits = f"double 0x{struct.pack('>d', number).hex().upper()}"
         return f"<{', '.join([bits] * self.vector.lanes)}>"
 
     def call(self, operation: str, a: str, b: str) -> str:
@@ -116,22 +98,21 @@ class Code:
         Args:
             above, below: whether x may lead above, below the range of powers.
         """
-        bias, fraction, bits = EXPONENTS[self.vector.real]
         # without a fraction, an exponent of zeros is 0 and one of ones is infinite
-        for cut, limit in ((above, (bias + 1) / factor), (below, -bias / factor)):
+        for cut, limit in ((above, (BIAS + 1) / factor), (below, -BIAS / factor)):
             if cut:
                 x = self.bounded(x, self.constant(limit), "ogt" if limit > 0 else "olt")
         v, c = self.vector, self.constant(factor)
         # adding it rounds to integers, in the last bits of the sum: those of an exponent
-        shift = self.constant(1.5 * 2.0**fraction + bias)
+        shift = self.constant(1.5 * 2.0**FRACTION_BITS + BIAS)
         moved = self.fused(x, c, shift)
         f = self.fused(x, c, self.value(f"fneg {v} {self.call('fsub', moved, shift)}"))
-        p, *rest = (self.constant(c) for c in reversed(EXP2[self.vector.real]))
+        p, *rest = (self.constant(c) for c in reversed(EXP2))
         for c in rest:
             p = self.fused(p, f, c)
-        whole = f"<{self.vector.lanes} x i{bits}>"
+        whole = f"<{v.lanes} x i64>"
         power = self.value(f"bitcast {v} {moved} to {whole}")
-        places = f"<{', '.join([f'i{bits} {fraction}'] * self.vector.lanes)}>"
+        places = f"<{', '.join([f'i64 {FRACTION_BITS}'] * v.lanes)}>"
         power = self.value(f"bitcast {whole} {self.value(f'shl {whole} {power}, {places}')} to {v}")
         return self.call("fmul", p, power)  # a product, so that NaN stays NaN whatever its bits
 
