@@ -140,7 +140,7 @@ class FitRows:
         rows = self.blocks[0][0]
         target = self.target[rows]
         n, m = target.shape
-        matrix = self.map.noise.rows(rows).add_to(self._at.rows(rows).gram())
+        matrix = self.map.noise.rows(rows).add_to(self._linearised[1].rows(rows).gram())
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
         good, seen = self._inliers(rows), self.map.noise.visible[rows]
         sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]
