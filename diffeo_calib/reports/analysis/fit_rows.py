@@ -122,7 +122,7 @@ class FitRows:
         """
         whole, noise = self._predictor, self.map.noise
         every = torch.arange(len(self), device=self.target.device)
-        parts = [(every, whole)] if isinstance(whole, CholeskyRegression) else self.blocks
+        parts = [(every, whole)] if len(whole.linearisation.sensitivity) == len(self) else self.blocks
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
         for rows, regression in parts:
             errors[rows], own = regression.left_out(self.target[rows])
