@@ -290,8 +290,8 @@ def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "moved.safetensors"
     table, options = kind.table("moved")
 
-    def registered(model: dc.CalibratedKinematics, rows: Any, *, free: str) -> dc.CalibratedKinematics:
-        assert (free, model.markers) == ("both", kind.model.markers)
+    def registered(model: dc.CalibratedKinematics, rows: Any, *, free: str, learn: bool) -> dc.CalibratedKinematics:
+        assert (free, learn, model.markers) == ("both", False, kind.model.markers)
         check_same_rows(rows, kind.moved)
         return kind.registered
 
