@@ -6,7 +6,8 @@ object names all columns of a table that is not there yet. A line without its ne
 
     {"id": 7, "joint_1": -28.1, ..., "joint_6": 78.9, "x": -1982.31, "y": 1750.62, "z": 349.83}
 
-Each line is answered by one, in order. A row that is answered is on the disk, with its verdict. ::
+Each line is answered by one, in order; one with an `id` says it again. A row that is answered is on the disk, with its
+verdict. The campaign also prints lines of its own: its state when it goes on, `shown`, `removed`, rows of others. ::
 
     {"id": 7, "line": 8, "fits": true, "accepted": true, "error_mm": 0.03, "usual_mm": 0.04, "cause": "",
      "change": null, "text": "row 8 fits: ...", "revised": [], "expected_error_mm": 0.21, "error_limit_mm": 0.27,

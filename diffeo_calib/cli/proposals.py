@@ -302,8 +302,11 @@ def _clear_reading(source: Source, formats: Mapping[Any, TableFormat], other: st
 
     None unless it is clearly better than all others, which ``other`` names.
     """
-    tables = {key: source.positions(table) for key, table in formats.items()}
-    residuals = {key: residual_of(source.robot, data) for key, data in tables.items() if data is not None}
+    residuals = {}
+    for key, table in formats.items():
+        data = source.positions(table)
+        if data is not None:
+            residuals[key] = residual_of(source.robot, data)
     found = min(residuals, key=lambda key: residuals[key], default=None)
     others = [value for key, value in residuals.items() if key != found]
     best = residuals.get(found, LARGEST_RESIDUAL)

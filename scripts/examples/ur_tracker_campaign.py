@@ -72,12 +72,15 @@ class Feed:
         self.campaign = campaign
 
     def send(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Send an object; the answer."""
+        """Send an object; the answer, after what the campaign says of its own."""
         assert self.campaign.stdin is not None
         assert self.campaign.stdout is not None
         self.campaign.stdin.write(json.dumps(row) + "\n")
         self.campaign.stdin.flush()
-        return json.loads(self.campaign.stdout.readline())
+        answer: dict[str, Any] = {}
+        while answer.get("id") != row.get("id") or not answer.keys() & {"rows", "error"}:
+            answer = json.loads(self.campaign.stdout.readline())
+        return answer
 
 
 def measured(feed: Feed, robot: Robot, tracker: Tracker, number: int) -> dict[str, Any]:

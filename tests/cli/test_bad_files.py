@@ -84,7 +84,7 @@ def test_outputs_are_checked_before_the_fit(
     case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     option, place, message = case
-    monkeypatch.setattr("diffeo_calib.cli.commands.fit.load_urdf", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.load_robot", lambda *_, **__: pytest.fail("the work has begun"))
     (tmp_path / "here.png").mkdir()
     done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
     assert done.code == 1
