@@ -200,6 +200,8 @@ def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
     assert covered(learnt, seen(arm, rest, T)) > 0.9
     torch.testing.assert_close(learnt.geometry.tool, record(learnt).markers, rtol=0, atol=0)
     assert len(learnt.configurations) == len(arm.model.configurations) + 60
+    held = placed.registered(rows, free="marker")  # a frame that is not known exactly, and held
+    assert len(held.configurations) == len(arm.model.configurations)
     bent = dc.Measurements(rows.q, rows.points * torch.tensor([1.0, 1.01, 1.0], dtype=torch.float64))
     with pytest.warns(dc.DiffeoCalibWarning) as told:
         kept = arm.model.registered(bent)

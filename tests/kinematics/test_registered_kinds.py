@@ -107,6 +107,20 @@ def test_positions_alone_register_a_model_with_a_ball() -> None:
     assert found.markers == kind.model.markers
 
 
+@pytest.mark.parametrize("learn", [True, False])
+def test_sockets_follow_every_registration(*, learn: bool) -> None:
+    """Of rows that are shifted twice they are where the second ones are."""
+    kind, found = kind_named("mixture"), kind_named("mixture").model
+    rows, shift = kind.new.device_rows(), torch.tensor([0.3, 0.0, 0.1], dtype=torch.float64)
+    for times in (1, 2):
+        found = found.registered(with_attributes(rows, points=rows.points + times * shift), learn=learn)
+    before, after = (placement(model) for model in (kind.model, found))
+    sockets = [name for own in kind.model.placement if own.kind == "socket" for name in own.names]
+    assert sockets
+    for name in sockets:
+        assert_close(after[name][:3], before[name][:3] + 2 * shift, rtol=0, atol=2e-3)
+
+
 def test_a_registered_robot_carries_its_payload() -> None:
     kind = kind_named("payloads")
     assert kind.model.with_payload(3.0).registered(kind.moved).payload == 3.0

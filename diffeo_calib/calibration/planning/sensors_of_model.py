@@ -91,7 +91,9 @@ def _known_devices(model: CalibratedKinematics) -> Iterator[DeviceReadings]:
             effects, own = noise.shared[rows[0], numbers], noise.covariance[rows][:, numbers][:, :, numbers]
             offset = float(effects[-1, effects[-1].nonzero()[-1]])  # of an unknown zero, as its prior has it
             device = replace(device, deviations=one.constants.new_tensor(kind.prior(offset)))
-            yield DeviceReadings(None, device, moved[rows].any(0), own.median(0).values)
+            columns = moved[rows].any(0)
+            mine = model.map.registration is None and int(columns.sum()) == len(device.deviations)  # no set-up's
+            yield DeviceReadings(None, device, columns if mine else None, own.median(0).values, around=not mine)
 
 
 def _unnamed_rows(model: CalibratedKinematics, device: Devices, taken: list[Tensor]) -> Tensor:

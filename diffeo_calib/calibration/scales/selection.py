@@ -194,7 +194,8 @@ class _Search:
 
     def __init__(self, centre: Hyperparameters, data: TangentData, limits: SearchLimits, progress: Progress) -> None:
         self.centre, self.data, self.limits, self.progress = centre, data, limits, progress
-        self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
+        self.best, self.best_likelihood = centre, -float("inf")
+        self.best_value = self.climbed = -float("inf")  # of all climbs, and of this one
         self.done = self.ends = self.total = 0
 
     def climb(self, starts: Sequence[Hyperparameters], iterations: int) -> None:
@@ -204,7 +205,7 @@ class _Search:
         self.total = len(starts) * iterations
         for number, start in enumerate(starts):
             self.done, self.ends = number * iterations, (number + 1) * iterations
-            options, x0 = {"maxiter": iterations}, start.logarithms().numpy()
+            options, x0, self.climbed = {"maxiter": iterations}, start.logarithms().numpy(), -float("inf")
             with torch_alone():
                 minimize(self._objective, x0, jac=True, method="L-BFGS-B", options=options)
 
@@ -215,8 +216,9 @@ class _Search:
         point = torch.from_numpy(vector)
         found = log_posterior(point, self.centre, self.data)
         if found is None:
-            return COST_OF_FAILURE - self.best_value, np.zeros_like(vector)
+            return COST_OF_FAILURE - self.climbed, np.zeros_like(vector)
         value = found.likelihood + found.prior
+        self.climbed = max(self.climbed, value)
         if value > self.best_value:
             self.best, self.best_value = self.centre.from_logarithms(point), value
             self.best_likelihood = found.likelihood

@@ -52,6 +52,12 @@ class NewDate(NamedTuple):
     observe: Observation | None = None
 
 
+def joins(old: FittedMap, count: int) -> bool:
+    """Whether old rows are known as measured, and as many new ones leave their matrix dense if it is."""
+    (N, r), known = old.noise.covariance.shape[:2], old.slopes is None or old.y is not None
+    return known and (old.data is not None or not N * r <= MAX_DENSE < (N + count) * max(r, old.m))
+
+
 def both_dates(
     old: FittedMap, nominal: GeometryMap, new: NewDate, drifted: list[Tensor], factor: float
 ) -> tuple[Problem, Momenta]:

@@ -28,7 +28,7 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates
+from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates, joins
 from diffeo_calib.kinematics.re_registration.estimate import (
     Estimate,
     Place,
@@ -90,7 +90,9 @@ def register_again(
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
-    if not (learn and found.part.session.same and open_by < LARGEST_M_RAD) or registration.doubtful:
+    learn = learn and found.part.session.same and open_by < LARGEST_M_RAD and not registration.doubtful
+    learn = learn and (model.registration is None or free == "both")  # what is held must be known
+    if not (learn and joins(fit, len(found.best.rows.residual))):
         placed = moved(fit, registration.transform).inflated(found.best.inflation)
         return RegisteredMap(placed, registration), registration
     learnt = moved(_learnt(fit, nominal, found), found.best.T)
@@ -224,13 +226,11 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
 
     Args:
         old, new: the models, of the same points.
-        T: (4, 4) from the frame of the fit of the old one, before it was registered, to that of the new one, m.
+        T: (4, 4) from the frame of the old one to that of the new one, m.
     """
     if not old.placement:
         return ()
     q, T = old.configurations, T.to(HOST)
-    if old.map.registration is not None:
-        T = T @ torch.linalg.inv(old.map.registration.transform.to(HOST))
     before, after, turns = (each.detach().to(HOST) for each in (old(q), new(q), new.turns(q)))
     P = min(before.shape[1], after.shape[1])
     away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
