@@ -23,9 +23,8 @@ from diffeo_calib.sensors.coordinates import errors_of_kinds
 
 FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
-CHOSEN_FACTOR, UNCHOSEN_FACTOR = 1.6, 16.0
-"""On the squared distance of an outlier, since scales are estimated; and where the rows are too few to choose scales:
-defaults may be overconfident."""
+UNCHOSEN_FACTOR = 16.0
+"""On the squared distance of an outlier where the rows are too few to choose scales: defaults may be overconfident."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is reported."""
 MOST_CONFIGURATIONS = 8000
@@ -147,7 +146,7 @@ def outliers(
     """
     noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
     level = FALSE_ALARM_PROBABILITY / len(known(squares))
-    factor = UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else CHOSEN_FACTOR
+    factor = UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
     bad = squares > factor * noise.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
     each = left_out.errors.unflatten(1, (noise.bodies, -1))
     distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)

@@ -62,6 +62,8 @@ def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: S
     assert selection.likelihood == pytest.approx(found.likelihood, rel=1e-9)
     assert f"likelihood {found.likelihood:.1f} on {len(setting.data)} poses" in selection.status
     assert not selection.interrupted
+    moved = selection.scales.logarithms() - setting.scales.logarithms()
+    assert float(moved.abs().max()) <= SEARCH_LIMITS.log_range + 1e-9
 
 
 def test_same_seed_same_scales() -> None:

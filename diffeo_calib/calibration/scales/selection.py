@@ -21,16 +21,16 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.process.factor import Factor
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
-from diffeo_calib.regression.factor import Factor
 
 MESHING_LENGTHSCALE_RAD = 0.22
 """Default length scale of the transmission kernels on a circle: meshing of a reduction gear."""
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
 (tens of periods per turn) and eccentricity (one)."""
-COST_OF_FAILURE = 1e3
-"""Loss of log posterior where G + R cannot be factorised: the line search then shortens its step."""
+OBJECTIVE_OF_FAILURE = 1e12
+"""Objective where G + R cannot be factorised: the line search then shortens its step."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class SearchLimits:
         first: the same with ``first_coordinates`` measured coordinates; fewer coordinates cost less per iteration and
             have more local optima, and get more iterations.
         first_coordinates: see ``first``.
+        log_range: bound on the logarithm of a scale relative to its default.
     """
 
     poses: int = 150
@@ -53,6 +54,7 @@ class SearchLimits:
     most_first: int = 60
     first: int = 20
     first_coordinates: int = 450
+    log_range: float = 9.0
 
     def first_iterations(self, coordinates: int) -> int:
         """Iterations from each of several starts, for a number of measured coordinates."""
@@ -194,20 +196,24 @@ class _Search:
 
     def __init__(self, centre: Hyperparameters, data: TangentData, limits: SearchLimits, progress: Progress) -> None:
         self.centre, self.data, self.limits, self.progress = centre, data, limits, progress
-        self.best, self.best_likelihood = centre, -float("inf")
-        self.best_value = self.climbed = -float("inf")  # of all climbs, and of this one
+        self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
         self.done = self.ends = self.total = 0
 
     def climb(self, starts: Sequence[Hyperparameters], iterations: int) -> None:
         """Run the optimiser from each start."""
-        from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
-
         self.total = len(starts) * iterations
         for number, start in enumerate(starts):
             self.done, self.ends = number * iterations, (number + 1) * iterations
-            options, x0, self.climbed = {"maxiter": iterations}, start.logarithms().numpy(), -float("inf")
-            with torch_alone():
-                minimize(self._objective, x0, jac=True, method="L-BFGS-B", options=options)
+            self._climb(start, iterations)
+
+    def _climb(self, start: Hyperparameters, iterations: int) -> None:
+        from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        origin, reach = self.centre.logarithms().numpy(), self.limits.log_range
+        bounds = list(zip(origin - reach, origin + reach, strict=True))
+        x0 = start.logarithms().numpy().clip(origin - reach, origin + reach)
+        with torch_alone():
+            minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus the log posterior and its gradient, for scipy."""
@@ -216,9 +222,8 @@ class _Search:
         point = torch.from_numpy(vector)
         found = log_posterior(point, self.centre, self.data)
         if found is None:
-            return COST_OF_FAILURE - self.climbed, np.zeros_like(vector)
+            return OBJECTIVE_OF_FAILURE, np.zeros_like(vector)
         value = found.likelihood + found.prior
-        self.climbed = max(self.climbed, value)
         if value > self.best_value:
             self.best, self.best_value = self.centre.from_logarithms(point), value
             self.best_likelihood = found.likelihood

@@ -46,19 +46,6 @@ class Factor:
         white = white - self.W @ torch.cholesky_solve(self.W.T @ white, self.B)
         return torch.linalg.solve_triangular(self.L.T, white, upper=True)
 
-    def of_white(self, values: Tensor) -> Tensor:
-        """C values (M,) with C C^T = K^-1: L^-T (1 + W W^T)^-1/2 values."""
-        V, weights = self._root
-        white = values - self.W @ (V @ ((V.T @ (self.W.T @ values)) * weights))
-        return torch.linalg.solve_triangular(self.L.T, white[:, None], upper=True)[:, 0]
-
-    @cached_property
-    def _root(self) -> tuple[Tensor, Tensor]:
-        """V and w with (1 + W W^T)^-1/2 = 1 - W V diag(w) V^T W^T."""
-        squares, V = torch.linalg.eigh(self.W.T @ self.W)
-        root = (1.0 + squares.clamp(min=0.0)).sqrt()
-        return V, 1.0 / (root * (root + 1.0))
-
     @cached_property
     def inverse(self) -> Tensor:
         """K^-1 (M, M)."""
