@@ -107,7 +107,6 @@ SENTENCES = {
     "no errors of the robot": Sentence(
         "show no errors of the robot", lambda known: known.campaign.design.off_mm <= known.campaign.design.noise_mm
     ),
-    "few rows of a device": Sentence("rows of each device, got", lambda known: known.campaign.design.rows < 120),
     "few poses": Sentence("too few to select scales", lambda known: known.campaign.design.rows < 30),
     "scales contradicted": Sentence("contradict the selected", lambda known: known.ratio > 1.5 or known.inside < 0.85),
     "a length": Sentence("seems to differ by", lambda known: known.campaign.links_mm > 1.0),
