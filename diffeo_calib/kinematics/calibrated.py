@@ -190,8 +190,8 @@ class CalibratedKinematics:
                 where they are.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: deviation of the markers from their old places on the flange, m; by default the rows decide.
-            learn: False finds places alone, for rows that judge the robot afterwards. So it is where rows contradict
-                the model, leave a place open, or show another number of markers.
+            learn: False finds places alone, for rows that judge the robot afterwards. So it is for models of readings
+                and where rows contradict the model, leave a place open, or show another number of markers.
 
         Returns:
             the model in the new measuring frame; its :attr:`registration` says what was found.

@@ -53,9 +53,9 @@ class NewDate(NamedTuple):
 
 
 def joins(old: FittedMap, count: int) -> bool:
-    """Whether old rows are known as measured, and as many new ones leave their matrix dense if it is."""
-    (N, r), known = old.noise.covariance.shape[:2], old.slopes is None or old.y is not None
-    return known and (old.data is not None or not N * r <= MAX_DENSE < (N + count) * max(r, old.m))
+    """Whether old rows tell coordinates, and as many new ones leave their matrix dense if it is."""
+    N, m = len(old.x), old.m
+    return old.slopes is None and (old.data is not None or not N * m <= MAX_DENSE < (N + count) * m)
 
 
 def both_dates(
