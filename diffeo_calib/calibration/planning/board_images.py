@@ -82,7 +82,7 @@ class BoardImages(Sensor):
             noise, shared = scene.noise[rows], points.new_zeros(len(rows), 9, scene.shifts)
         else:
             noise, by_lens = self.tells(points)
-            noise = noise + (0.0 if self.rest is None else self.rest)
+            noise = noise + (SMALLEST_REST_M**2 * eye if self.rest is None else self.rest)
             shared = by_lens @ (self.camera.root if self.effects is None else self.effects)
             shared = self._new(scene, shared) if self.effects is None else shared
         if self.set_up.columns is not None and scene.shifts:
