@@ -64,7 +64,7 @@ def test_options_that_do_not_go_with_a_bag_are_named(words: list[object], comman
 def test_rows_are_played_at_their_times() -> None:
     rows, inbox, waited = [{"time": time} for time in (7.0, 47.0, 48.0)], Queue(), []
     play(rows, inbox, 10.0, waited.append)
-    assert [inbox.get().entry for _ in range(3)] == rows
+    assert [inbox.get() for _ in range(3)] == rows
     assert inbox.get() is None
     assert waited == pytest.approx([0.0, 4.0, 4.1], abs=0.05)
     play([], inbox, 1.0, lambda _: math.nan)
