@@ -23,7 +23,7 @@ from diffeo_calib.sensors.coordinates import errors_of_kinds
 
 FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
-UNCHOSEN_FACTOR = 16.0
+UNCHOSEN_FACTOR = 9.0
 """On the squared distance of an outlier where the rows are too few to choose scales: defaults may be overconfident."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is reported."""

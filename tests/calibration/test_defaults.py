@@ -62,6 +62,16 @@ def test_a_slide_is_measured_by_its_stroke() -> None:
     assert not kernel.terms[slide].periodic[slide]  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_a_slide_that_stands_still_has_a_long_kernel() -> None:
+    """A field as large as the noise does not fold a kernel of many times its length."""
+    setting, slide = built("sliding"), 2
+    x = setting.tangent_data.x.clone()
+    x[:, slide] = x[0, slide]
+    for noise in (1e-3, 1e-2):
+        scales = defaults(replace(setting.tangent_data, x=x), noise, setting.identification.prior)
+        assert_close(float(scales.coupled_lengthscale[slide]), 50 * noise)
+
+
 def test_the_unit_of_length_does_not_matter() -> None:
     """The same robot ten times as large: lengths of the scales grow tenfold, angles stay."""
     setting = built("sliding")

@@ -12,8 +12,9 @@ from product_bank import ur10_measurements
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import Prior, identify
+from diffeo_calib.calibration.identification.identification import Prior, identify, least_squares_of
 from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -127,6 +128,21 @@ def test_scales_of_the_joint_errors_are_found() -> None:
         assert larger == pytest.approx(1e-3, rel=0.5)
         assert smaller < 4e-4  # the smaller one is still falling when the noise has settled
         assert (prior.translation > prior.rotation) == (translation > rotation_size)
+
+
+def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
+    """The first step of Gauss-Newton leads to u = 1, from where on there are no errors, such as behind a camera."""
+
+    def errors(u: Tensor) -> Tensor:
+        if float(u[0]) > 0.9:
+            raise InputError("behind the camera")
+        return 100 * (1 / (1 - u) - 2)
+
+    found = least_squares_of(errors, lambda u: torch.diag(100 / (1 - u) ** 2), torch.zeros(1, dtype=torch.float64))
+    assert found.converged
+    assert float(found.u[0]) == pytest.approx(0.5, abs=1e-4)
+    with pytest.raises(InputError, match="behind"):
+        least_squares_of(errors, lambda u: u[None], torch.ones(1, dtype=torch.float64))
 
 
 def test_what_is_given_stays() -> None:

@@ -209,6 +209,15 @@ def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
     assert len(kept.configurations) == len(arm.model.configurations)
 
 
+def test_a_model_that_is_dense_stays_dense(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans need the covariances of a dense model: rows that would end it are not learnt."""
+    size = 3 * arm.model.markers * len(arm.model.configurations)
+    rows = seen(arm, slice(0, 20), transform(22))
+    for largest, more in ((size + 60 * arm.model.markers, 20), (size, 0)):
+        monkeypatch.setattr("diffeo_calib.kinematics.re_registration.both_dates.MAX_DENSE", largest)
+        assert len(arm.model.registered(rows).configurations) == len(arm.model.configurations) + more
+
+
 def test_one_wrong_row_of_eight(arm: Case) -> None:
     T = transform(10)
     data = seen(arm, slice(0, 8), T)
