@@ -11,6 +11,7 @@ draws. Judged are
 
 - errors (`error`, `true`; geometric mean over arms): none more than 5 % worse, their geometric mean over all not worse;
 - shares in 95 % regions (`new`, `inside`; mean): 0.90 to 0.99, or not farther from that than before, within 0.01;
+- the factor between expected and true error (`said`; geometric mean over arms): at most 1.5 times as large as before;
 - false alarms of a verb (`alarms`): not more; faults that it names (`named`): not fewer;
 - processor time of a verb, in units of a fixed work that is timed beside it: at most 1.1 times that of the
   baseline, if that is 10 s or more.
@@ -170,10 +171,13 @@ def read(*paths: Path) -> list[Record]:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Factors on errors of a case, on the geometric mean of all and on the time of a verb; slack of shares."""
+    """Factors on errors of a case, on the geometric mean of all, on how far the expected error is from the true one,
+    and on the time of a verb; slack of shares.
+    """
 
     case: float = 1.05
     mean: float = 1.002
+    said: float = 1.5
     share: float = 0.01
     time: float = 1.1
 
@@ -198,7 +202,7 @@ def geometric(values: Sequence[float]) -> float:
 def of_case(where: str, pairs: dict[str, list[tuple[Any, Any]]], allowed: Tolerance) -> tuple[list[float], list[str]]:
     """Ratios of errors of a case, and sentences about what is worse."""
     ratios, worse = [], []
-    for name in ("error", "true", "new", "inside"):
+    for name in ("error", "true", "new", "inside", "said"):
         values = pairs[name]
         if any(now is None for now, _ in values):
             worse.append(f"{where}: no {name} any more")
@@ -207,6 +211,10 @@ def of_case(where: str, pairs: dict[str, list[tuple[Any, Any]]], allowed: Tolera
             ratios.append(now / was)
             if now > allowed.case * was:
                 worse.append(f"{where}: {name} {was:.4g} -> {now:.4g}, {100 * (now / was - 1):+.1f} %")
+        elif values and name == "said":
+            now, was = (geometric([max(one, 1.0 / one) for one in each]) for each in zip(*values, strict=True))
+            if now > allowed.said * was:
+                worse.append(f"{where}: expected and true error are a factor {now:.3g} apart, {was:.3g} before")
         elif values:
             now, was = (sum(each) / len(each) for each in zip(*values, strict=True))
             if outside(now) > outside(was) + allowed.share:

@@ -15,8 +15,8 @@ HIDDEN_VARIANCE = 1e8
 
 
 def measured_coordinates(covariance: Tensor) -> Tensor:
-    """Which coordinates were measured, by their blocks (N, m, m): (N, m) boolean. Turned blocks are rounded."""
-    return covariance.diagonal(dim1=1, dim2=2) < 0.5 * HIDDEN_VARIANCE
+    """Which coordinates were measured, by their blocks (N, m, m), perhaps turned and weighed: (N, m) boolean."""
+    return covariance.diagonal(dim1=1, dim2=2) < 1e-3 * HIDDEN_VARIANCE
 
 
 def without_hidden(covariance: Tensor, visible: Tensor) -> Tensor:

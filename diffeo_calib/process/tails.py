@@ -129,16 +129,18 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     """
     seen = ~squares.isnan()
     d2, k = squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
-    best, found = -inf, (0.0, 1.0, 1.0)
-    student = max(_student(d2 / s, k, nu) - 0.5 * float(k.sum()) * log(s) for s in VARIANCES for nu in FREEDOMS)
-    shares = squares.new_tensor(SHARES)[:, None]
+    shares, factors = squares.new_tensor(SHARES)[:, None, None], squares.new_tensor(FACTORS)[:, None]
+    freedoms, best, found, student = squares.new_tensor(FREEDOMS)[:, None], -inf, (0.0, 1.0, 1.0), -inf
+    half = 0.5 * (freedoms + k)
+    level = (torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()).sum(1)
     for s in VARIANCES:
-        good = -0.5 * (d2 / s + k * log(s))
-        for c in FACTORS:
-            gross = -0.5 * (d2 / (c * s) + k * log(c * s))
-            value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(1)
-            if float(value.max()) > best:
-                best, found = float(value.max()), (SHARES[int(value.argmax())], c, s)
+        scale = 0.5 * float(k.sum()) * log(s)
+        student = max(student, float((level - (half * (d2 / (s * freedoms)).log1p()).sum(1)).max()) - scale)
+        good, gross = -0.5 * d2 / s, -0.5 * (d2 / (factors * s) + k * factors.log())
+        value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(2) - scale
+        if float(value.max()) > best:
+            share, factor = divmod(int(value.argmax()), len(FACTORS))
+            best, found = float(value.max()), (SHARES[share], FACTORS[factor], s)
     if best < student + EVIDENCE:
         return None
     share, c, s = found
@@ -147,10 +149,3 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     if float(good[seen].mean()) < 0.5:  # noise that is said to be far too small is not gross
         return None
     return (good + (1.0 - good) / c).nan_to_num(1.0)
-
-
-def _student(squares: Tensor, dim: Tensor, freedom: float) -> float:
-    """Log likelihood of Student's t, but for the constants of a Gaussian."""
-    half, nu = 0.5 * (freedom + dim), squares.new_tensor(0.5 * freedom)
-    level = torch.lgamma(half) - torch.lgamma(nu) - 0.5 * dim * nu.log()
-    return float((level - half * (squares / freedom).log1p()).sum())

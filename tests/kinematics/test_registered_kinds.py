@@ -121,6 +121,17 @@ def test_sockets_follow_every_registration(*, learn: bool) -> None:
         assert_close(after[name][:3], before[name][:3] + 2 * shift, rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["images of a board", "two cameras on the tool", "hidden markers", "several tips"])
+def test_rows_teach_a_registered_model_what_they_teach_a_recalibrated_one(name: str) -> None:
+    """Of a robot that has not changed both are conditioned on old and new rows."""
+    kind = kind_named(name)
+    q, again = kind.q(40), dc.recalibrate(kind.model, kind.moved, drift="none").model
+    (mean, covariance), (other, expected) = (one.predict(q, noise=False) for one in (kind.registered, again))
+    usual = float(expected.diagonal(dim1=-2, dim2=-1).mean().sqrt())
+    assert float((mean - other).square().mean().sqrt()) < usual
+    assert float(covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt()) == pytest.approx(usual, rel=0.5)
+
+
 def test_a_registered_robot_carries_its_payload() -> None:
     kind = kind_named("payloads")
     assert kind.model.with_payload(3.0).registered(kind.moved).payload == 3.0

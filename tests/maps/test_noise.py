@@ -10,7 +10,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.noise import Noise, mean_block, measured_coordinates, without_hidden
 
 
 def explicit(noise: Noise) -> Tensor:
@@ -79,7 +79,7 @@ def test_hidden_coordinates_carry_no_information() -> None:
         assert float(noise.solve(values)[row, ~seen].abs().sum()) < 1e-6
 
 
-def test_hidden_coordinates_stay_hidden_in_another_frame() -> None:
+def test_hidden_coordinates_stay_hidden_in_another_frame_and_with_weights() -> None:
     blocks, visible = gaps()
     angle = torch.tensor(0.7, dtype=torch.float64)
     turn = torch.eye(3, dtype=torch.float64)
@@ -87,6 +87,7 @@ def test_hidden_coordinates_stay_hidden_in_another_frame() -> None:
     both = torch.block_diag(turn, turn)
     turned = both @ without_hidden(blocks, visible) @ both.mT
     assert Noise(0.5 * (turned + turned.mT)).visible.tolist() == visible.tolist()
+    assert measured_coordinates(turned / 2.5).tolist() == visible.tolist()  # the largest weight of a row
 
 
 def test_mean_block_leaves_out_what_was_hidden() -> None:

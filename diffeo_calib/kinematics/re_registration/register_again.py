@@ -115,7 +115,7 @@ def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMa
     free = rows.residual.new_full((3 * P,), (PLACES.same_m if metres == SAME_PLACE else metres) * session.body_free)
     free[len(free) - 3 * session.ball :] = 0.0
     new = NewDate(
-        markers=best.body.points,
+        markers=best.body.old if metres == SAME_PLACE else best.body.points,
         payload=session.nominal.payload,
         q=session.q,
         y=session.seen(best.T).flatten(1).nan_to_num(0.0),
