@@ -177,8 +177,7 @@ def found_outliers(
     """
     if not bool(bad.any()):
         return []
-    data = data.bodies.on_tips(data, model.on)
-    labels = data.bodies.labels(data)
+    labels = data.bodies.labels(data, model.on)
     predicted = model.at_payloads(data.payload)(data.q).detach()
     found = [
         Outlier(
@@ -223,9 +222,9 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
 
 def _exchanged_with(row: int, body: int, data: Measurements, predicted: Tensor, small: float) -> int | None:
     """The marker with which marker ``body`` of a row seems to be exchanged, if any."""
-    if data.seen_bodies.shape[1] > MAX_MARKERS_FOR_EXCHANGE:
+    if data.lever is not None or data.markers > MAX_MARKERS_FOR_EXCHANGE:
         return None
-    for other in data.bodies.exchangeable(data):
+    for other in range(data.markers):
         errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
         if other != body and float(errors.max()) < small:
             return other

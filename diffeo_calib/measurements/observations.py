@@ -5,7 +5,7 @@ The ball is one target: that of the rows in sockets, of the readings, and the la
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, covariates, payloads
+from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,
     RANGES,
@@ -25,7 +25,6 @@ from diffeo_calib.measurements.rows import (
     common,
     joint_ranges,
     set_attributes,
-    with_attributes,
 )
 
 WITH_POSITION = ("position", "pose", "mixture")
@@ -44,27 +43,22 @@ class Observations(RowGroups):
             :class:`Readings`, in the order of their first rows. Positions and rows in sockets are parts of their own.
         index: (N_i,) int64 for each part, its row numbers here.
 
-    Attributes:
-        q: (N, n) joint configurations, rad or m.
-        line_numbers: (N,) int64, where every row comes from, see :class:`Measurements`. A line that holds observations
-            of several kinds is several rows.
-        payload: (N,) known masses that the robot carried; None where they are not known.
+    Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload and covariates
+    hold the values of all rows. A line of a file that holds observations of several kinds is several rows.
     """
-
-    parts: tuple[Any, ...]
-    index: tuple[Tensor, ...]
-    q: Tensor
-    line_numbers: Tensor
-    payload: Tensor | None
 
     def __init__(self, parts: Sequence[Any], index: Sequence[Tensor]) -> None:
         order = sorted(range(len(index)), key=lambda k: int(index[k].min()))
-        tables, numbers = [parts[k] for k in order], [index[k] for k in order]
+        tables = [parts[k] for k in order]
         _check_joinable(tables)
-        set_attributes(self, parts=tuple(tables), index=tuple(numbers))
-        payload = None if tables[0].payload is None else self._whole([part.payload for part in tables])
-        lines = self._whole([part.line_numbers for part in tables])
-        set_attributes(self, q=self._whole([part.q for part in tables]), line_numbers=lines, payload=payload)
+        set_attributes(self, parts=tuple(tables), index=tuple(index[k] for k in order))
+        for name in ("joint_names", "payload_at", "covariate_names"):
+            set_attributes(self, **{name: getattr(tables[0], name)})
+        for name in ("file_sha256", "origin"):
+            set_attributes(self, **{name: common([getattr(part, name) for part in tables])})
+        for name in ("q", "line_numbers", "payload", "covariates"):
+            own = [getattr(part, name) for part in tables]
+            set_attributes(self, **{name: None if own[0] is None else self._whole(own)})
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:
@@ -75,37 +69,6 @@ class Observations(RowGroups):
                 on other tips, other sockets, or a ball on another tip.
         """
         return _observations(_pieces(parts))
-
-    @property
-    def joint_names(self) -> tuple[str, ...] | None:
-        """Names of the joints, in the order of the columns of ``q``."""
-        return self.parts[0].joint_names
-
-    @property
-    def payload_at(self) -> str | None:
-        """Name of the link that carried the payloads; None for the robot's tip."""
-        return self.parts[0].payload_at
-
-    @property
-    def covariate_names(self) -> tuple[str, ...]:
-        """Names of the columns of ``covariates``."""
-        return self.parts[0].covariate_names
-
-    @property
-    def covariates(self) -> Tensor | None:
-        """(N, K) values with which something may drift; None without any."""
-        own = [part.covariates for part in self.parts]
-        return None if own[0] is None else self._whole(own)
-
-    @property
-    def file_sha256(self) -> str | None:
-        """SHA-256 of the file that all rows were read from; None for arrays, or several files."""
-        return common([part.file_sha256 for part in self.parts])
-
-    @property
-    def origin(self) -> object | None:
-        """That file and how it was read; None for arrays, or several files."""
-        return common([part.origin for part in self.parts])
 
     @property
     def sha256(self) -> str:
@@ -205,43 +168,10 @@ class Observations(RowGroups):
                 numbers.append(here)
         return Observations(parts, numbers)
 
-    def to(self, device: torch.device | str) -> Observations:
-        """Return the same rows with their values on a device."""
-        return Observations([part.to(device) for part in self.parts], self.index)
-
-    def with_joint_names(self, names: Sequence[str]) -> Observations:
-        """Return the same rows under other names of the joints, see :meth:`Measurements.with_joint_names`."""
-        return Observations([part.with_joint_names(names) for part in self.parts], self.index)
-
-    def with_payload(self, payload: object, at: str | None = None) -> Observations:
-        """Return the same rows with a payload of known mass, see :meth:`Measurements.with_payload`."""
-        masses = None if payload is None else payloads(payload, self.q)
-        own = [None if masses is None else masses[rows.to(masses.device)] for rows in self.index]
-        return Observations([part.with_payload(m, at) for part, m in zip(self.parts, own, strict=True)], self.index)
-
-    def with_covariates(self, *, time: object = None, temperature: object = None) -> Observations:
-        """Return the same rows with columns with which something may drift: :meth:`Measurements.with_covariates`."""
-        found = covariates({"time": time, "temperature": temperature}, self.q)
-        parts = []
-        for part, rows in zip(self.parts, self.index, strict=True):
-            own = found["covariates"]
-            own = own[rows.to(own.device)] if isinstance(own, Tensor) else None
-            parts.append(with_attributes(part, covariates=own, covariate_names=found["covariate_names"]))
-        return Observations(parts, self.index)
-
-    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Observations:
-        """Return the same rows with other line numbers (N,), see :meth:`Measurements.with_line_numbers`."""
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row").to(HOST)
-        parts = [part.with_line_numbers(lines[rows]) for part, rows in zip(self.parts, self.index, strict=True)]
-        return Observations(parts, self.index)
-
-    def with_file_sha256(self, sha256: str | None) -> Observations:
-        """Return the same rows as those of the file with this SHA-256."""
-        return Observations([part.with_file_sha256(sha256) for part in self.parts], self.index)
-
-    def with_origin(self, origin: object) -> Observations:
-        """Return the same rows as those of a table that can be read again."""
-        return Observations([part.with_origin(origin) for part in self.parts], self.index)
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Observations:
+        """See :class:`RowGroups`."""
+        pairs = zip(self.parts, self.index, strict=True)
+        return Observations([change(part, rows) for part, rows in pairs], self.index)
 
     def _whole(self, values: Sequence[Tensor]) -> Tensor:
         """Values (N_i, ...) of the parts in the order of the rows: (N, ...)."""

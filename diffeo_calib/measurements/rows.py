@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -38,6 +38,8 @@ def set_attributes(data: object, **attributes: object) -> None:
         object.__setattr__(data, name, value)
 
 
+ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
+"""Columns of numbers that stay on the host."""
 NO_SOCKET = -1
 """Number of the socket of rows whose positions a device measured."""
 REPEAT_TOLERANCE = 1e-3
@@ -144,10 +146,23 @@ def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> t
 
 @methods_outside_inference_mode
 class RowGroups:
-    """Rows that are divided, with repeated configurations kept together, and the sockets of a place."""
+    """Rows that are divided, with repeated configurations kept together, and the sockets of a place.
+
+    Attributes:
+        parts: tables of one kind each. index: (N_i,) int64 for each part, its row numbers here.
+    """
 
     q: Tensor
     line_numbers: Tensor
+    joint_names: tuple[str, ...] | None
+    payload: Tensor | None
+    payload_at: str | None
+    file_sha256: str | None
+    origin: object | None
+    covariates: Tensor | None
+    covariate_names: tuple[str, ...]
+    parts: tuple[Any, ...]
+    index: tuple[Tensor, ...]
 
     @property
     def n(self) -> int:
@@ -172,6 +187,83 @@ class RowGroups:
         """Some of the rows."""
         raise NotImplementedError
 
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
+        """The same rows after a change of each part, given with its row numbers (N_i,)."""
+        raise NotImplementedError
+
+    def with_columns(self, **columns: object) -> Self:
+        """The same rows with other attributes; tensors (N, ...) have a value for each row."""
+
+        def changed(part: Any, rows: Tensor) -> Any:
+            own = {name: v[rows.to(v.device)] if isinstance(v, Tensor) else v for name, v in columns.items()}
+            return with_attributes(part, **own)
+
+        return self.of_each(changed)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same rows with their values on a device."""
+        place = usable(device)
+
+        def moved(part: Any, _: Tensor) -> Any:
+            return with_attributes(part, **{k: v.to(place) for k, v in part.columns.items() if k not in ON_HOST})
+
+        return self.of_each(moved)
+
+    def with_joint_names(self, names: Sequence[str]) -> Self:
+        """Return the same rows under other names of the joints.
+
+        Raises:
+            MeasurementError: a number of names that does not match, or repeated names.
+        """
+        return self.with_columns(joint_names=unique_names(names, "names", self.n, "column of `q`"))
+
+    def with_payload(self, payload: object, at: str | None = None) -> Self:
+        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return self.with_columns(payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
+        """Return the same rows with columns with which device or arm may drift.
+
+        A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
+        the model, which then holds for the middle of each column's range.
+
+        Args:
+            time, temperature: values (N,), in any unit; None if they are not known.
+
+        Raises:
+            MeasurementError: not one per row, or not finite.
+        """
+        return self.with_columns(**covariates({"time": time, "temperature": temperature}, self.q))
+
+    def with_load(self, load: Payload) -> Self:
+        """Return the same rows with the masses of a payload, if there is one."""
+        return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
+
+    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
+        """Return the same rows with other line numbers (N,), which tell where every row comes from.
+
+        Raises:
+            MeasurementError: not one per row.
+        """
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
+
+    def with_file_sha256(self, sha256: str | None) -> Self:
+        """Return the same rows as those of the file with this SHA-256."""
+        return self.with_columns(file_sha256=sha256)
+
+    def with_origin(self, origin: object) -> Self:
+        """Return the same rows as those of a table that can be read again."""
+        return self.with_columns(origin=origin)
+
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
         raise NotImplementedError
@@ -179,14 +271,12 @@ class RowGroups:
     @property
     def masses(self) -> Tensor:
         """(N,) payloads of the rows; (0,) where they are not known."""
-        payload = getattr(self, "payload", None)
-        return self.q.new_zeros(0) if payload is None else payload
+        return self.q.new_zeros(0) if self.payload is None else self.payload
 
     @property
     def drifting(self) -> dict[str, Tensor]:
         """The covariates (N,) by name."""
-        values: Any = getattr(self, "covariates", None)
-        return {} if values is None else dict(zip(getattr(self, "covariate_names", ()), values.T, strict=True))
+        return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
 
     @property
     def places(self) -> Tensor:
@@ -207,11 +297,6 @@ class RowGroups:
     def smallest_inflation(self) -> float:
         """Smallest factor on variances that errors of left-out rows justify: no reading shows every direction."""
         return 1.0 if self.without_device else 0.0
-
-    @property
-    def resting(self) -> tuple[Self, ...]:
-        """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
-        return ()
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -285,10 +370,6 @@ class RowGroups:
         return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 
-ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
-"""Columns of numbers that stay on the host."""
-
-
 @methods_outside_inference_mode
 class RowTable(RowGroups):
     """N rows with one value per column and row; its columns are the attributes ``BY_ROW`` that are not None."""
@@ -302,11 +383,6 @@ class RowTable(RowGroups):
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
 
-    joint_names: tuple[str, ...] | None
-    payload: Tensor | None
-    payload_at: str | None
-    file_sha256: str | None
-    origin: object | None
     covariates: Tensor | None = None
     """(N, K) values with which something may drift, such as times and temperatures, in any unit."""
     covariate_names: tuple[str, ...] = ()
@@ -341,65 +417,9 @@ class RowTable(RowGroups):
         chosen = chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 
-    def to(self, device: torch.device | str) -> Self:
-        """Return the same rows with their values on a device."""
-        place = usable(device)
-        return with_attributes(self, **{name: t.to(place) for name, t in self.columns.items() if name not in ON_HOST})
-
-    def with_joint_names(self, names: Sequence[str]) -> Self:
-        """Return the same rows under other names of the joints.
-
-        Raises:
-            MeasurementError: a number of names that does not match, or repeated names.
-        """
-        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
-
-    def with_payload(self, payload: object, at: str | None = None) -> Self:
-        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
-
-        Args:
-            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
-            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
-
-        Raises:
-            MeasurementError: not one per row, negative, or not finite.
-        """
-        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
-
-    def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
-        """Return the same rows with columns with which device or arm may drift.
-
-        A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
-        the model, which then holds for the middle of each column's range.
-
-        Args:
-            time, temperature: values (N,), in any unit; None if they are not known.
-
-        Raises:
-            MeasurementError: not one per row, or not finite.
-        """
-        return with_attributes(self, **covariates({"time": time, "temperature": temperature}, self.q))
-
-    def with_load(self, load: Payload) -> Self:
-        """Return the same rows with the masses of a payload, if there is one."""
-        return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
-
-    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
-        """Return the same rows with other line numbers (N,), which tell where every row comes from.
-
-        Raises:
-            MeasurementError: not one per row.
-        """
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
-
-    def with_file_sha256(self, sha256: str | None) -> Self:
-        """Return the same rows as those of the file with this SHA-256."""
-        return with_attributes(self, file_sha256=sha256)
-
-    def with_origin(self, origin: object) -> Self:
-        """Return the same rows as those of a table that can be read again."""
-        return with_attributes(self, origin=origin)
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
+        """See :class:`RowGroups`."""
+        return change(self, *self.index)
 
     def to_frame(self) -> Any:
         """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.

@@ -170,11 +170,6 @@ class SocketTable(RowTable):
         changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
         return with_attributes(rows, **changes, session=None, session_names=())
 
-    @property
-    def resting(self) -> tuple[Self, ...]:
-        """See :attr:`RowGroups.resting`."""
-        return () if self.socket is None or not bool((self.socket != NO_SOCKET).any()) else (self.socket_rows(),)
-
     def with_sockets_of_rows(self) -> Self:
         """The same rows without the sockets that hold the ball in none of them, and without distances to these."""
         if self.socket is None or self.sockets is None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.bodies import Bodies, bodies_of
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
@@ -290,7 +290,7 @@ class Measurements(ImageTable, SocketTable):
     @property
     def bodies(self) -> Bodies:
         """Bodies in the rows: markers, or frames."""
-        return bodies_of(self.lever)
+        return Bodies(self.lever)
 
     @property
     def origins(self) -> Tensor:

@@ -133,7 +133,8 @@ class TableFormat:
         if rotation_std:
             given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
             std = _by_frame("rotation_std", given, "three names", 3)
-        return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
+        angle = unit if count == 3 or rotation_std else None
+        return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
 
     def _check_rotation_unit(self, *, has_angles: bool) -> None:
         """The unit of a rotation must be named where there are angles, and only there."""

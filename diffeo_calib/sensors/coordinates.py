@@ -408,14 +408,14 @@ def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
         MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
             say on which of them their markers are.
     """
-    bodies = data.bodies
+    bodies, one = data.bodies, "marker" if data.lever is None else "frame"
     if data.on is not None and not set(data.on) <= set(robot.tips):
-        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {bodies.one}"
+        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {one}"
         got = listed(data.on[:: bodies.points])
         raise MeasurementError.of(what, expected=f"names among {listed(robot.tips)}", got=got, fix=fix)
     if data.on is None and len(robot.tips) > 1:
         what = f"robot '{robot.name}' has {len(robot.tips)} tips ({listed(robot.tips)})"
-        fix = f"pass {bodies.maker}(..., on=[...]) with the tip of every {bodies.one}"
+        fix = f"pass Measurements{'.from_poses' * (data.lever is not None)}(..., on=[...]) with the tip of every {one}"
         what += f", and the measurements do not say on which of them their {bodies.many} are"
         raise MeasurementError.of(what, fix=fix)
     return data.on or (robot.tip,) * data.markers

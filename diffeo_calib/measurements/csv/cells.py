@@ -13,14 +13,13 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, NamedTuple, TextIO
 
 import torch
 from torch import Tensor
@@ -164,8 +163,24 @@ _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 _EMPTY = re.compile(r"|nan|n/?a|null|none", re.IGNORECASE)
 HIDDEN = "all cells of a hidden marker or frame are empty, and every line shows some"
-Hideable = tuple[Sequence[int], Sequence[int]]
-"""Places of a marker's, or frame's, values among the wanted columns, and of its standard deviations."""
+
+
+class Hideable(NamedTuple):
+    """Columns that lines may leave empty together: places of values and of deviations among all; what they show."""
+
+    values: Sequence[int]
+    deviations: Sequence[int]
+    word: str
+
+
+class Block(NamedTuple):
+    """Lines of a file: numbers (B, c), NaN where hidden, texts by the name of their column, and the lines' numbers."""
+
+    numbers: Tensor
+    texts: dict[str, list[str]]
+    lines: list[int]
+
+
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
@@ -179,30 +194,32 @@ def number_blocks(
     rows: int,
     hideable: Sequence[Hideable] = (),
     *,
+    texts: Mapping[str, bool] = {},  # not changed
     all_hidden: bool = False,
-) -> Iterator[tuple[Tensor, list[int]]]:
+) -> Iterator[Block]:
     """Read some columns of a CSV file in blocks of rows.
 
     Args:
         file: the file, with one header line.
-        wanted: names of c columns.
+        wanted: names of c columns of numbers.
         decimal: ``"."`` or ``","``.
         rows: most rows of a block.
-        hideable: the columns of markers that rows may hide: not all of them in one row, unless ``all_hidden``.
+        hideable: the columns that rows may hide: not all of them in one row, unless ``all_hidden``.
+        texts: names of columns of texts, and whether the file must have them; "nan" is an empty text.
 
     Yields:
-        (B, c) finite numbers as written in the file, NaN for hidden markers, and the line number of every row; nothing
-        more from the first block with a mistake on.
+        finite numbers as written in the file; nothing more from the first block with a mistake on.
 
     Raises:
         MeasurementError: anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the whole
             file first.
     """
-    columns = _find_columns(file.path, file.header, wanted, file.sep)
+    named = [name for name, needed in texts.items() if needed or name in file.header]
+    places = _find_columns(file.path, file.header, [*wanted, *named], file.sep)
     mistakes = _Mistakes(file.path, wanted, decimal, markers=len(hideable))
     for lines in file.blocks(rows):
         whole = mistakes.without_ragged(lines, len(file.header))
-        cells = [[cells[column] for column in columns] for _, cells in whole]
+        cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]
         numbers, hidden = _parse(cells, decimal), []
         if numbers is None and hideable:
             hidden = _fill_hidden(cells, hideable, all_hidden=all_hidden)
@@ -212,7 +229,9 @@ def number_blocks(
         elif not mistakes:
             if hidden:
                 numbers[tuple(zip(*hidden, strict=True))] = math.nan
-            yield numbers, [line for line, _ in lines]
+            own = zip(named, places[len(wanted) :], strict=True)
+            found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
+            yield Block(numbers, found, [line for line, _ in lines])
     mistakes.raise_first()
 
 
@@ -228,78 +247,6 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         mistakes.without_ragged(lines, len(file.header))
         mistakes.raise_first()
         return file.header, lines
-
-
-@dataclass(frozen=True)
-class TextCells:
-    """The cells of a CSV file as text, which are read when they are first asked for.
-
-    Args:
-        path, sep: the file and its separator.
-    """
-
-    path: Path
-    sep: str
-
-    @cached_property
-    def _read(self) -> tuple[list[str], dict[int, list[str]]]:
-        header, rows = read_cells(self.path, self.sep)
-        return [name.strip() for name in header], dict(rows)
-
-    @property
-    def header(self) -> list[str]:
-        """Names of the columns."""
-        return self._read[0]
-
-    def texts(
-        self,
-        column: str,
-        lines: Sequence[int],
-        *,
-        empty: bool = False,
-        expected: str = "a name",
-        fix: str = "fill it in",
-    ) -> list[str]:
-        """The cells of one column in these lines, as text without blanks around it; "nan" is an empty cell.
-
-        Args:
-            column: its name. lines: numbers of the lines.
-            empty: whether cells may be empty. expected: what they hold. fix: what to do about an empty one.
-
-        Raises:
-            MeasurementError: no such column, several, or an empty cell unless ``empty``.
-        """
-        names, cells = self._read
-        if names.count(column) != 1:
-            what, got = f"file '{self.path}', column '{column}'", f"{names.count(column)} of {few(names)}"
-            fix = "name a column of the table"
-            raise MeasurementError.of(what, expected="one column of this name", got=got, fix=fix)
-        place = names.index(column)
-        texts = [cells[line][place].strip() for line in lines]
-        texts = ["" if text.lower() == "nan" else text for text in texts]  # as programs write what is missing
-        if "" in texts and not empty:
-            bad = BadCells()
-            for line, text in zip(lines, texts, strict=True):
-                if not text:
-                    bad.add(line, column, text)
-            raise bad.error(self.path, expected, fix)
-        return texts
-
-    def numbers(self, column: str, lines: Sequence[int], decimal: str, fix: str, *, empty: bool = False) -> Tensor:
-        """(N,) the cells of one column as numbers in the unit of the file, NaN for empty ones if they may be.
-
-        Raises:
-            MeasurementError: as :meth:`texts`; a cell that is no finite number.
-        """
-        found = []
-        for line, text in zip(lines, self.texts(column, lines, empty=empty, expected="a number", fix=fix), strict=True):
-            value = number(text, decimal) if text else None
-            if text and (value is None or not abs(value) < LARGEST_NUMBER):
-                what = f"file '{self.path}', line {line}, column '{column}'"
-                fix = "repair or remove this line; pass `decimal` if the numbers have another decimal mark"
-                raise MeasurementError.of(what, expected="a number", got=shown(repr(text)), fix=fix)
-            found.append(math.nan if value is None else value)
-        return torch.tensor(found, dtype=torch.float64, device=HOST)
 
 
 def repeated(names: Sequence[str]) -> list[str]:
@@ -441,12 +388,12 @@ def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hid
     """Write zeros into the cells of hidden markers, in place, and return their places (row, column)."""
     filled = []
     for number_of_row, cells in enumerate(rows):
-        hidden = [all(_EMPTY.fullmatch(cells[k]) for k in places) for places, _ in hideable]
+        hidden = [all(_EMPTY.fullmatch(cells[k]) for k in own.values) for own in hideable]
         if all(hidden) and not all_hidden:
             continue  # no marker at all: a mistake
-        for (places, deviations), gone in zip(hideable, hidden, strict=True):
-            for column in (*places, *deviations) if gone else ():
-                if column in places or _EMPTY.fullmatch(cells[column]):
+        for own, gone in zip(hideable, hidden, strict=True):
+            for column in (*own.values, *own.deviations) if gone else ():
+                if column in own.values or _EMPTY.fullmatch(cells[column]):
                     cells[column] = "0"
                     filled.append((number_of_row, column))
     return filled
