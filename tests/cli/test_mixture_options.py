@@ -120,7 +120,7 @@ def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyP
     ("change", "message"),
     [
         (lambda cells: [*cells[:8], "", "", ""], r"line 2: expected a position or a socket, got neither"),
-        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column 'socket': expected the name of a place or socket"),
+        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column .socket.: expected the name"),
         (lambda cells: [*cells[:9], "", ""], r"line 2, column 'y'.*: expected a finite number, got an empty cell"),
     ],
 )  # fmt: skip

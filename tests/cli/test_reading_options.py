@@ -106,7 +106,7 @@ def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
             ["--reading", "distance=0"],
             "--reading distance=0: expected a distance above 0; write the length of the ball bar",
         ),
-        (["--reading", "distance=signed"], "t.csv', line 3, column 'signed': expected a distance above 0, got -7"),
+        (["--reading", "distance=signed"], "t.csv', line 3, column 'signed': expected a distance above 0, got '-7'"),
         (["--reading", "distance=wire", "--session", "gaps"], "line 3, column 'gaps': expected the name of the device"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),
     ],

@@ -67,8 +67,8 @@ def test_one_number_for_all_rows_and_pixels(table: Path) -> None:
         (("410,5", ""), "line 4, column 'd': expected a finite number, got an empty cell; remove or repair"),
         (("south", " "), "line 4, column 'where': expected the name of the device of this reading, got an empty cell;"),
         (("north", ""), r"line 2, column 'where' \(and 1 more, on line 5\): expected the name of the device"),
-        (("410,5", "-1"), "line 4, column 'd': expected a distance above 0, got -1; repair or remove these lines"),
-        (("410,5", "0"), "line 4, column 'd': expected a distance above 0, got 0"),
+        (("410,5", "-1"), "line 4, column 'd': expected a distance above 0, got '-1'; repair or remove these lines"),
+        (("410,5", "0"), "line 4, column 'd': expected a distance above 0, got '0'"),
         (("50;60;420;14;9;north", "10,5;20;400,25;1;1;north"), "line 5 repeats 2"),
     ],
 )

@@ -160,7 +160,11 @@ ROW = "0.1,1,2,3,0.1,0.2,0.3,1,2,3,0.1,0.2,0.3\n"
         (HEADER + ROW, {"rotation_std": ["A", "B", "C"]}, ("`position` beside `rotation_std`", "1 list")),
         (HEADER + ROW + "1,,,,,,,1,2,3,0,,0\n", {}, ("line 3, column 'B'", "an empty cell")),
         (HEADER + ROW + "1,,,,,,0,1,2,3,0,0,0\n", {}, ("line 3, column 'x'", "an empty cell")),
-        (HEADER + "1,,,,,,,1,2,3,0,0,0\n", {}, ("columns x, y, z, a, b and 1 more", "shows this frame; leave them out")),
+        (
+            HEADER + "1,,,,,,,1,2,3,0,0,0\n",
+            {},
+            ("columns x, y, z, a, b and 1 more", "shows this frame; leave them out"),
+        ),
     ],
 )
 def test_wrong_tables_are_one_clear_error(

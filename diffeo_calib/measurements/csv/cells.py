@@ -41,7 +41,7 @@ class CsvLines:
     """A CSV file (UTF-8, one header line, blank lines skipped), used as a context.
 
     Args:
-        path: the file. What can be read only once, such as a pipe, is copied while it is read the first time.
+        path: the file. What can be read only once, such as a pipe, is copied first.
         sep: one character between cells.
 
     Attributes:
@@ -58,15 +58,15 @@ class CsvLines:
         self.path, self.sep = path, sep
         self._stack = ExitStack()
         self._file: TextIO
-        self._copy: TextIO | None = None
-        self._read_once = False
-        self._first: Iterator[tuple[int, list[str]]]
 
     def __enter__(self) -> Self:
         with self._stack as stack:  # closed if the header cannot be read
             self._file = stack.enter_context(self._open())
-            self._first = self._cells()
-            header = next(self._first, None)
+            if not self._file.seekable():
+                copy = stack.enter_context(tempfile.TemporaryFile("w+", encoding="utf-8", newline=""))
+                copy.writelines(self._texts())
+                self._file = copy
+            header = next(self._cells(), None)
             if header is None:
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
@@ -79,22 +79,13 @@ class CsvLines:
 
     @property
     def progress(self) -> float:
-        """Fraction of the file that has been read; 0 for a pipe."""
+        """Fraction of the file that has been read."""
         size = os.fstat(self._file.fileno()).st_size
-        return min(self._file.buffer.tell() / size, 1.0) if size and self._file.seekable() else 0.0
-
-    def all(self) -> Lines:
-        """All lines below the header."""
-        return [line for block in self.blocks(LONGEST_LINE) for line in block]
+        return min(self._file.buffer.tell() / size, 1.0) if size else 0.0
 
     def blocks(self, rows: int) -> Iterator[Lines]:
         """The lines below the header, up to ``rows`` at once, from the first one at every call."""
-        lines, self._first = self._first, iter(())
-        if self._read_once:
-            lines = self._cells()
-            next(lines)
-        self._read_once = True
-        count = 0
+        lines, count = islice(self._cells(), 1, None), 0
         while block := list(islice(lines, rows)):
             count += len(block)
             yield block
@@ -135,23 +126,11 @@ class CsvLines:
             raise MeasurementError.of(what, fix="copy it to another disk first") from error
 
     def _texts(self) -> Iterator[str]:
-        """The lines as text; the first time a pipe is read, they are copied."""
+        """The lines of the file as text, from the first one if it can be read again."""
         if self._file.seekable():
             self._file.seek(0)
-            yield from self._bounded(self._file)
-        elif self._copy is None:
-            copy = tempfile.TemporaryFile("w+", encoding="utf-8", newline="")  # noqa: SIM115  # closed with the file
-            self._copy = self._stack.enter_context(copy)
-            for text in self._bounded(self._file):
-                self._copy.write(text)
-                yield text
-        else:
-            self._copy.seek(0)
-            yield from self._copy
-
-    def _bounded(self, file: TextIO) -> Iterator[str]:
         number = 0
-        while text := file.readline(LONGEST_LINE):
+        while text := self._file.readline(LONGEST_LINE):
             number += 1
             if len(text) == LONGEST_LINE:
                 what = f"file '{self.path}', line {number} has more than {LONGEST_LINE} characters"
@@ -242,7 +221,7 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         MeasurementError: a file that cannot be read or has no rows, or lines of different lengths.
     """
     with CsvLines(path, sep) as file:
-        lines = file.all()
+        lines = [line for block in file.blocks(LONGEST_LINE) for line in block]
         mistakes = _Mistakes(path, (), ".")
         mistakes.without_ragged(lines, len(file.header))
         mistakes.raise_first()
@@ -287,8 +266,7 @@ class _Mistakes:
 
     def __init__(self, path: Path, wanted: Sequence[str], decimal: str, markers: int = 0) -> None:
         self.path, self.wanted, self.decimal, self.markers = path, wanted, decimal, markers
-        self.ragged: list[int] = []
-        self.expected = self.got = 0
+        self.ragged: list[tuple[int, int]] = []
         self.unreadable, self.missing = BadCells(), BadCells()
 
     def __bool__(self) -> bool:
@@ -296,12 +274,9 @@ class _Mistakes:
 
     def without_ragged(self, lines: Lines, expected: int) -> Lines:
         """The lines that have the expected number of cells."""
-        whole = [(line, cells) for line, cells in lines if len(cells) == expected]
-        if len(whole) < len(lines):
-            others = [(line, len(cells)) for line, cells in lines if len(cells) != expected]
-            self.expected, self.got = expected, self.got or others[0][1]
-            self.ragged += [line for line, _ in others]
-        return whole
+        self.expected = expected
+        self.ragged += [(line, len(cells)) for line, cells in lines if len(cells) != expected]
+        return [(line, cells) for line, cells in lines if len(cells) == expected]
 
     def add(self, lines: Sequence[int], rows: Sequence[Sequence[str]]) -> None:
         """Find the cells that are no finite numbers in the wanted columns of some lines."""
@@ -316,10 +291,10 @@ class _Mistakes:
     def raise_first(self) -> None:
         """Raise MeasurementError if anything is wrong."""
         if self.ragged:
-            what = f"file '{self.path}', line {few(self.ragged)}"
+            what = f"file '{self.path}', line {few([line for line, _ in self.ragged])}"
             fix = "repair these lines (a cell that holds the separator must be quoted)"
-            expected = f"{self.expected} cells as in the header"
-            raise MeasurementError.of(what, expected=expected, got=self.got, fix=fix)
+            expected, got = f"{self.expected} cells as in the header", self.ragged[0][1]
+            raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
         if self.unreadable.first:
             fix = _number_hint(self.unreadable.first[2], self.decimal)
             raise self.unreadable.error(self.path, "a number", fix)

@@ -16,7 +16,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.cells import Block, CsvLines, number, number_blocks, read_cells
+from diffeo_calib.measurements.csv.cells import BadCells, Block, CsvLines, number, number_blocks, read_cells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.poses import LEVER
 
@@ -158,51 +158,28 @@ class TableFile:
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
-        columns, largest, wrong = self.columns, None, _Wrong(self.path, self.columns)
+        columns, largest = self.columns, None
+        checks = [group.check for group in columns.groups.values() for _ in group.names]
+        wrong = {place: (check, BadCells()) for place, check in enumerate(checks) if check is not None}
         unseen, self.rows = columns.hideable, 0
         for block in self._numbers():
             raw = block.numbers
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
             largest = most if largest is None else torch.maximum(largest, most)
-            wrong.add(block)
+            for place, (check, bad) in wrong.items():
+                values = raw[:, place]
+                for row in (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist():
+                    bad.add(block.lines[row], columns.names[place], f"{float(values[row]):g}")
             unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
             self.rows += len(block.lines)
             yield block
         if largest is not None:
             for text in columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
-        wrong.raise_first()
+        for check, bad in wrong.values():
+            if bad.first:
+                raise bad.error(self.path, check.expected, check.fix)
         for own in unseen if self.rows else ():
             names = few([columns.names[place] for place in own.values])
             what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
-
-
-class _Wrong:
-    """Numbers that cannot be what their columns hold: the first one, and how many of its kind there are."""
-
-    def __init__(self, path: Path, columns: Columns) -> None:
-        checks = [group.check for group in columns.groups.values() for _ in group.names]
-        self.path, self.names, self.count = path, columns.names, 0
-        self.checks = {place: check for place, check in enumerate(checks) if check is not None}
-        self.first: tuple[int, int, float] | None = None
-
-    def add(self, block: Block) -> None:
-        """Look for wrong numbers in a block of rows."""
-        wrong = torch.zeros_like(block.numbers, dtype=torch.bool)
-        for place, check in self.checks.items():
-            values = block.numbers[:, place]
-            wrong[:, place] = values < 0 if check.zero else values <= 0
-        bad = wrong.nonzero()
-        self.count += len(bad)
-        if len(bad) and self.first is None:
-            row, column = (int(i) for i in bad[0])
-            self.first = block.lines[row], column, float(block.numbers[row, column])
-
-    def raise_first(self) -> None:
-        """Raise MeasurementError if there are some."""
-        if self.first is not None:
-            line, column, value = self.first
-            what, check = f"file '{self.path}', line {line}, column '{self.names[column]}'", self.checks[column]
-            got = f"{value:g}" + f" ({self.count} such cells)" * (self.count > 1)
-            raise MeasurementError.of(what, expected=check.expected, got=got, fix=check.fix)
