@@ -243,6 +243,11 @@ def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tupl
     return tuple(name for name in names for _ in range(points))
 
 
+def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[str]:
+    """(N,) names of numbered things, "" for the number -1, and for all of ``rows`` without numbers."""
+    return [""] * rows if numbers is None else [names[number] if number >= 0 else "" for number in numbers.tolist()]
+
+
 def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
     """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
     if names is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -12,9 +13,10 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers
+from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers, texts_of
 from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
-from diffeo_calib.measurements.rows import RowTable, with_attributes
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,11 +33,9 @@ Known = tuple[int, int] | Camera
 ONLY_CAMERA = "camera"
 """Name of a camera that is alone."""
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
-IMAGE_COLUMNS = ("corners", "seen_by", *OF_POSES)
-NO_IMAGES = dict.fromkeys(IMAGE_COLUMNS) | {"cameras": {}}
 
 
-class ImageTable(RowTable):
+class ImageTable(SocketTable):
     """Columns of tables of images beside poses.
 
     Attributes:
@@ -46,18 +46,13 @@ class ImageTable(RowTable):
             larger than was said, as a share. All in the axes of :func:`pose_jacobian`.
     """
 
-    frames: Any
-    points: Tensor
-    board: Tensor | None
-    lever: Any
-    session: Tensor | None
-    session_names: tuple[str, ...]
-    corners: Tensor | None
-    cameras: Mapping[str, Camera]
-    seen_by: Tensor | None
-    pose_covariance: Tensor | None
-    pose_shared: Tensor | None
-    pose_larger: Tensor | None
+    BY_IMAGE = ("corners", "seen_by", *OF_POSES)
+    corners: Tensor | None = None
+    cameras: Mapping[str, Camera] = MappingProxyType({})
+    seen_by: Tensor | None = None
+    pose_covariance: Tensor | None = None
+    pose_shared: Tensor | None = None
+    pose_larger: Tensor | None = None
 
     @classmethod
     def from_images(
@@ -103,27 +98,6 @@ class ImageTable(RowTable):
         found = with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
         return found.with_sessions(seen_by, remounted=camera_on_tool)
 
-    @classmethod
-    def from_poses(cls, q: Any, poses: Any, joint_names: Sequence[str] | None = None, **known: Any) -> Self:
-        """See :meth:`Measurements.from_poses`."""
-        raise NotImplementedError
-
-    def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Self:
-        """See :meth:`Measurements.with_sessions`."""
-        raise NotImplementedError
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables, their set-ups numbered alike."""
-        names = tuple(dict.fromkeys(name for table in tables for name in table.session_names))
-        found = []
-        for table in super().of_one_layout(tables):
-            numbers = [*(names.index(name) for name in table.session_names), -1]
-            own = torch.tensor(numbers, dtype=torch.int64, device=HOST)
-            session = None if table.session is None else own[table.session]
-            found.append(table if session is None else with_attributes(table, session=session, session_names=names))
-        return found
-
     @property
     def camera(self) -> Camera | None:
         """The only camera; None without images, or of several."""
@@ -132,8 +106,7 @@ class ImageTable(RowTable):
     @property
     def camera_names(self) -> list[str]:
         """(N,) name of the camera of each image."""
-        names = list(self.cameras)
-        return [] if self.seen_by is None else [names[number] for number in self.seen_by.tolist()]
+        return [] if self.seen_by is None else texts_of(self.seen_by, list(self.cameras), len(self))
 
     def set_ups(self, names: Sequence[str] | None, *, remounted: bool) -> Sequence[str] | None:
         """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them.
@@ -204,8 +177,7 @@ class ImageTable(RowTable):
             raise MeasurementError.of("frames on the tool", expected="poses of a camera on it", got="others")
         M = transforms.to(self.points)
         R, frames = M[:, :3, :3], self.frames @ torch.linalg.inv(M)[:, None]
-        changes: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
-        changes |= {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
+        changes = ONE_SESSION | {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
         changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
         for name in ("std", "rotation_std"):
             known = getattr(self, name)

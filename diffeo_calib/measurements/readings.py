@@ -24,6 +24,7 @@ from diffeo_calib.measurements.checks import (
     deviations,
     joint_table,
     session_numbers,
+    texts_of,
     tip_names,
 )
 from diffeo_calib.measurements.observations import joined_tables
@@ -65,6 +66,7 @@ class Readings(RowTable):
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
 
+    NUMBERED = "device", "names"
     flattery = FLATTERY
 
     kind: str
@@ -277,7 +279,7 @@ class Readings(RowTable):
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the device of each row."""
-        return [self.names[number] for number in self.device.tolist()]
+        return texts_of(self.device, self.names, len(self))
 
     @property
     def ball_tip(self) -> str | None:
@@ -328,16 +330,6 @@ class Readings(RowTable):
     def copies(self) -> list[tuple[int, int]]:
         """(earlier row, row) for every row that repeats an earlier one exactly, its device included."""
         return exact_copies(torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1))
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Readings]) -> Sequence[Readings]:
-        """The same tables, their devices numbered alike."""
-        names = tuple(dict.fromkeys(name for table in tables for name in table.names))
-        found = []
-        for table in tables:
-            own = torch.tensor([names.index(name) for name in table.names], dtype=torch.int64, device=HOST)
-            found.append(with_attributes(table, device=own[table.device], names=names))
-        return found
 
 
 def _doubted(data: Readings, doubt: bool) -> Readings:

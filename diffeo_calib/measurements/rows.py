@@ -150,17 +150,18 @@ class RowGroups:
 
     Attributes:
         parts: tables of one kind each. index: (N_i,) int64 for each part, its row numbers here.
+        covariates: (N, K) values with which something may drift, such as times and temperatures, in any unit.
     """
 
     q: Tensor
     line_numbers: Tensor
-    joint_names: tuple[str, ...] | None
-    payload: Tensor | None
-    payload_at: str | None
-    file_sha256: str | None
-    origin: object | None
-    covariates: Tensor | None
-    covariate_names: tuple[str, ...]
+    joint_names: tuple[str, ...] | None = None
+    payload: Tensor | None = None
+    payload_at: str | None = None
+    file_sha256: str | None = None
+    origin: object | None = None
+    covariates: Tensor | None = None
+    covariate_names: tuple[str, ...] = ()
     parts: tuple[Any, ...]
     index: tuple[Tensor, ...]
 
@@ -380,12 +381,11 @@ class RowTable(RowGroups):
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
 
+    NUMBERED: ClassVar[tuple[str, str]]
+    """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
+
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
-
-    covariates: Tensor | None = None
-    """(N, K) values with which something may drift, such as times and temperatures, in any unit."""
-    covariate_names: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -470,8 +470,15 @@ class RowTable(RowGroups):
 
     @classmethod
     def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables with the same columns, those of a few being empty."""
-        return tables
+        """The same tables with the same columns, those of a few being empty, and set-ups or devices numbered alike."""
+        column, texts = cls.NUMBERED
+        names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
+        found = []
+        for table in tables:
+            own, numbers = [*(names.index(name) for name in getattr(table, texts)), -1], getattr(table, column)
+            new = torch.tensor(own, dtype=torch.int64, device=HOST)
+            found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
+        return found
 
 
 def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:

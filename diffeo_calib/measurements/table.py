@@ -26,10 +26,11 @@ from diffeo_calib.measurements.checks import (
     marker_places,
     seen_markers,
     session_numbers,
+    texts_of,
     tip_names,
     unique_names,
 )
-from diffeo_calib.measurements.images import IMAGE_COLUMNS, NO_IMAGES, ImageTable
+from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
@@ -45,12 +46,12 @@ from diffeo_calib.measurements.pose_frames import (
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.sockets import Distances, SocketTable, socket_numbers
+from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(ImageTable, SocketTable):
+class Measurements(ImageTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -95,13 +96,11 @@ class Measurements(ImageTable, SocketTable):
     """
 
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
-    BY_ROW = (*BY_ROW, "covariates", *IMAGE_COLUMNS)
+    BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
 
-    poses: Tensor | None
-    lever: float | None
-    rotation_std: Tensor | None
+    NUMBERED = "session", "session_names"
 
     def __init__(
         self,
@@ -122,10 +121,7 @@ class Measurements(ImageTable, SocketTable):
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        set_attributes(self, session=None, session_names=(), remounted=False, socket=None, sockets=None)
-        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             self.check_every_marker_seen()
             self.warn_if_suspicious()
@@ -334,8 +330,7 @@ class Measurements(ImageTable, SocketTable):
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the set-up in which each row was measured, "" without one."""
-        numbers = [-1] * len(self) if self.session is None else self.session.tolist()
-        return ["" if number < 0 else self.session_names[number] for number in numbers]
+        return texts_of(self.session, self.session_names, len(self))
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
@@ -459,7 +454,7 @@ class Measurements(ImageTable, SocketTable):
         """The rows with their first markers moved, (N, P, 3) m, as one session."""
         rest = self.points[:, shifts.shape[1] :]
         points = torch.cat([self.points[:, : shifts.shape[1]] + shifts, rest], 1)
-        return with_attributes(self, points=points, session=None, session_names=(), remounted=False)
+        return with_attributes(self, points=points, **ONE_SESSION)
 
     def in_frames(self, transforms: Tensor) -> Measurements:
         """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.
@@ -469,8 +464,7 @@ class Measurements(ImageTable, SocketTable):
         """
         T = transforms.to(self.points)
         R, shift = T[:, :3, :3], T[:, None, :3, 3]
-        changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
-        changes["remounted"] = False
+        changes = ONE_SESSION | {"points": self.points @ R.mT + shift}
         changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses

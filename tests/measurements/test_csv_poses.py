@@ -130,7 +130,7 @@ def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: 
     [
         (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,,30,1\n", {}, ("line 3, column 'b'", "an empty cell")),
         (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,nan,30,1\n", {}, ("line 3, column 'b'", "'nan'")),
-        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "positive", "'0';")),
+        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "got '0'")),
         (
             POSE_HEADER + "0,0,1,2,3,10,2,30,-1\n" * 2,
             {"std": ["d"], "duplicates": "keep"},

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns
 from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
-from diffeo_calib.measurements.csv.writing import write_measurements
+from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings
@@ -104,17 +104,6 @@ def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: 
         text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
         warn_user(f"{text} (line {few([at[row] for row in dropped])}); pass duplicates='keep' to keep them.")
     return data.rows(np.setdiff1d(np.arange(count), dropped))
-
-
-__all__ = [
-    "open_joints",
-    "read_joints",
-    "read_measurements",
-    "read_observations",
-    "read_readings",
-    "read_table",
-    "write_measurements",
-]
 
 
 @outside_inference_mode
@@ -228,21 +217,6 @@ def _read(
         raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
     columns = replace(columns, joints=joints, kinds=columns.kinds or kinds)
     return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
-
-
-def read_table(
-    path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
-    position: Names,
-    table: TableFormat,
-    *,
-    duplicates: str = "error",
-    kinds: Sequence[str] | None = None,
-    session: str | None = None,
-) -> Measurements:
-    """The same as :func:`read_measurements` for a format that is given as one object."""
-    columns = TableColumns(joints, position, session=session, kinds=kinds)
-    return read_observations(path, columns, table, duplicates=duplicates)
 
 
 @outside_inference_mode
