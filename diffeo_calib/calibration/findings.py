@@ -17,7 +17,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 
@@ -222,9 +222,9 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
 
 def _exchanged_with(row: int, body: int, data: Measurements, predicted: Tensor, small: float) -> int | None:
     """The marker with which marker ``body`` of a row seems to be exchanged, if any."""
-    if data.lever is not None or data.markers > MAX_MARKERS_FOR_EXCHANGE:
+    if data.seen_bodies.shape[1] > MAX_MARKERS_FOR_EXCHANGE:
         return None
-    for other in range(data.markers):
+    for other in data.bodies.exchangeable(data):
         errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
         if other != body and float(errors.max()) < small:
             return other

@@ -87,8 +87,7 @@ class CalibratedKinematics:
         learnt: Registration | None = None,
     ) -> None:
         self.bodies = Bodies(lever)
-        if map.m // 3 % self.bodies.points:
-            raise InputError.of("a model of poses", expected="three points for each", got=map.m // 3)
+        self.bodies.check_points(map.m // 3)
         self.robot = robot
         self.map = map
         self.summary = summary

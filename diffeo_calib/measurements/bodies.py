@@ -104,6 +104,10 @@ class Bodies:
         mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2)
         return Predicted(points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
 
+    def written(self, model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
+        """The same as files hold it: markers (N, B, 3) m, or poses; covariances."""
+        return model.predict(q) if self.lever is None else model.predict_poses(q)
+
     def origins(self, points: Tensor) -> Tensor:
         """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
         return points if self.lever is None else middles(points)
@@ -162,6 +166,22 @@ class Bodies:
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
         return pose_jacobian(frames, self.lever, board)
 
+    def perhaps_moved(self, *, far: bool) -> bool:
+        """Whether a device or body may have moved, if the origins are ``far`` off or not: turns do not show there."""
+        return far or self.lever is not None
+
+    def moved_words(self, points: int) -> str:
+        """Name in messages for this number of points of the tool that may have moved."""
+        return f"the {'marker' if self.lever is None else 'tool'}{'s' * (points > self.points)}"
+
+    def mirrored(self, data: Any) -> Iterator[Tensor]:
+        """Points (N, P, 3) in a frame of the other hand; none where a rotation shows the hand."""
+        yield from [] if self.lever is not None else [data.points * data.points.new_tensor([1.0, 1.0, -1.0])]
+
+    def exchangeable(self, data: Any) -> range:
+        """Bodies whose numbers may be exchanged in a row: a tip has one frame."""
+        return range(data.markers if self.lever is None else 0)
+
     def labels(self, data: Any, on: Sequence[str] | None = None) -> list[tuple[int | None, str | None]]:
         """Number of each of several markers, tip of each of several frames; ``on``: of points that name none."""
         count = data.markers // self.points
@@ -174,6 +194,11 @@ class Bodies:
         if self.lever is None or data.frames is None or data.lever == self.lever:
             return data
         return with_attributes(data, points=points_of_frames(data.frames, self.lever), lever=self.lever)
+
+    def check_points(self, points: int) -> None:
+        """Raise InputError for a number of points of a model that no such bodies have."""
+        if points % self.points:
+            raise InputError.of("a model of poses", expected="three points for each", got=points)
 
     def pose_lever(self) -> float:
         """The lever; InputError for markers."""

@@ -118,7 +118,7 @@ def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[s
         names = [str(name) for name in chosen]
     angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
     check_size(angles, "q")
-    return angles, unique_names(names, "joint_names", angles.shape[1], "column of `q`")
+    return angles, checked_names(names, "joint_names", angles.shape[1], "column of `q`")
 
 
 def check_size(values: Tensor, name: str) -> None:
@@ -187,18 +187,26 @@ def check_rows(q: Tensor, other: Tensor, name: str) -> None:
 
 
 def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
-    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
+    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer; None if not known.
+
+    They are NaN where ``like`` is hidden, and given ones may be missing there.
+    """
     if value is None:
         return None
-    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
+    shapes, empty = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)], like.isnan()
     fix = "pass one standard deviation for all, one per row, or finer"
+    if bool(empty.any()):
+        value = real_tensor(value, name).detach().to(like.device)
+        if value.ndim >= 2 and value.shape == like.shape[: value.ndim]:
+            value = value.masked_fill(empty if value.ndim == like.ndim else empty.flatten(value.ndim).all(-1), 1.0)
     given = copied(value, name, *shapes, fix=fix).to(like.device)
     bad = (given <= 0).nonzero()
     if len(bad):
         where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
         what = f"`{name}`" + f", first at index {where}" * bool(where)
         raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
-    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+    found = given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape)
+    return found.masked_fill(empty, torch.nan)
 
 
 def covariates(given: Mapping[str, object], q: Tensor) -> dict[str, object]:
@@ -234,13 +242,9 @@ def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tupl
     Args:
         names: of the bodies' tips. bodies: number of markers or measured frames. points: of each body.
     """
-    if names is None:
-        return None
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != bodies or not all(isinstance(name, str) for name in names):
-        fix = f"pass the name of a tip for every {'marker' if points == 1 else 'measured frame'}"
-        raise MeasurementError.of("`on`", expected=f"{bodies} names", got=f"{len(names)} ({names})", fix=fix)
-    return tuple(name for name in names for _ in range(points))
+    each = "marker" if points == 1 else "measured frame"
+    found = checked_names(names, "on", bodies, each, distinct=False)
+    return found and tuple(name for name in found for _ in range(points))
 
 
 def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[str]:
@@ -257,21 +261,23 @@ def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | No
     return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
 
 
-def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
-    """Return distinct names, one for each of ``count`` things."""
+def checked_names(
+    names: Sequence[str] | None, what: str, count: int, each: str, *, distinct: bool = True
+) -> tuple[str, ...] | None:
+    """Return names, one for each of ``count`` things, of which none has two unless ``distinct`` is False."""
     if names is None:
         return None
     try:
         names = (names,) if isinstance(names, str) else tuple(names)
     except (TypeError, RuntimeError):
         names = ()
+    fix = f"pass one per {each}"
     if not all(isinstance(name, str) for name in names):
         got = few([type(name).__name__ for name in names])
-        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=f"pass one name per {each}")
+        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=fix)
     if len(names) != count:
-        got = f"{len(names)} ({names})"
-        raise MeasurementError.of(f"`{what}`", expected=count, got=got, fix=f"pass one per {each}")
-    if len(set(names)) < len(names):
+        raise MeasurementError.of(f"`{what}`", expected=f"{count} names", got=f"{len(names)} ({names})", fix=fix)
+    if distinct and len(set(names)) < len(names):
         fix = "rename the repeated ones"
         raise MeasurementError.of(f"`{what}`", expected="distinct names", got=list(names), fix=fix)
     return names
@@ -303,24 +309,6 @@ def marker_places(points: object) -> Tensor:
         what = f"`points`, row {few(rows)}: no marker was seen"
         raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
     return places.masked_fill(empty, torch.nan)
-
-
-def marker_deviations(std: object, places: Tensor, name: str = "std") -> Tensor | None:
-    """Standard deviations (N, P, 3) of markers, NaN where they are hidden; given ones may be missing there.
-
-    Args:
-        std: one for all, (N,), (N, P) or (N, P, 3), m; None if they are not known.
-        places: (N, P, 3) m, NaN where hidden.
-        name: of the argument, for messages.
-    """
-    empty = places.isnan()
-    if std is None or not bool(empty.any()):
-        return deviations(std, name, places)
-    given = real_tensor(std, name).detach().to(places.device)
-    if given.ndim >= 2 and given.shape == places.shape[: given.ndim]:
-        given = given.masked_fill(empty if given.ndim == 3 else empty.all(2), 1.0)
-    found = deviations(given, name, places)
-    return None if found is None else found.masked_fill(empty, torch.nan)
 
 
 def _check_whole(empty: Tensor) -> None:

@@ -187,15 +187,12 @@ def joined_tables(tables: Sequence[Any]) -> Any:
     """The rows of several tables in order: one table of measurements or readings if it can hold them."""
     pieces = _pieces(tables)
     kinds = {piece.table.kind for piece in pieces}
-    if not any(kinds <= one for one in ONE_TABLE):
-        found = _observations(pieces)
-        part, rows = next(zip(found.parts, found.index, strict=True))
-        return found if len(found.parts) > 1 else part.rows(rows.argsort())
-    own = [piece.table for piece in pieces]
-    if all(isinstance(table, RowTable) for table in tables):
-        return type(tables[0]).in_one(tables)
-    whole = type(own[0]).in_one(own)
-    return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+    if any(kinds <= one for one in ONE_TABLE):
+        whole = type(pieces[0].table).in_one([piece.table for piece in pieces])
+        return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+    found = _observations(pieces)
+    part, rows = next(zip(found.parts, found.index, strict=True))
+    return found if len(found.parts) > 1 else part.rows(rows.argsort())
 
 
 class _Piece(NamedTuple):

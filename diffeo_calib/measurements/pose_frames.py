@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import real_tensor, wrapped
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.checks import check_rows, deviations, marker_deviations
+from diffeo_calib.measurements.checks import check_rows, deviations
 from diffeo_calib.measurements.poses import (
     ONE_POSE,
     check_lever,
@@ -200,10 +200,8 @@ def pose_columns(
 
 def _deviations(value: object, name: str, places: Tensor) -> Tensor | None:
     """Standard deviations (N, T, 3) of values as they are given for frames at (N, T, 3)."""
-    if places.shape[1] > 1:
-        return marker_deviations(value, places, name)
-    found = deviations(value, name, places[:, 0])
-    return None if found is None else found[:, None]
+    found = deviations(value, name, places if places.shape[1] > 1 else places[:, 0])
+    return None if found is None else found.view(places.shape)
 
 
 def visible_rotation_numbers(frames: Tensor, convention: str, angle: str) -> Tensor:

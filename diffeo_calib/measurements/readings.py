@@ -28,7 +28,8 @@ from diffeo_calib.measurements.checks import (
     tip_names,
 )
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowTable, exact_copies, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.splits import exact_copies
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""

@@ -21,14 +21,14 @@ from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
     check_size,
+    checked_names,
+    deviations,
     joint_table,
-    marker_deviations,
     marker_places,
     seen_markers,
     session_numbers,
     texts_of,
     tip_names,
-    unique_names,
 )
 from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
@@ -45,8 +45,9 @@ from diffeo_calib.measurements.pose_frames import (
 )
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings, as_readings
-from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
+from diffeo_calib.measurements.splits import exact_copies
 
 
 @methods_outside_inference_mode
@@ -117,8 +118,8 @@ class Measurements(ImageTable):
         places = marker_places(points).to(angles.device)
         check_rows(angles, places, "points")
         check_size(places, "points")
-        markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = marker_deviations(std, places)
+        markers = checked_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
+        known = deviations(std, "std", places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))

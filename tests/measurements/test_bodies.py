@@ -35,10 +35,18 @@ MIXTURE = dc.Measurements.joined([MARKERS, SOCKETS])
 def test_markers_and_frames_have_names_and_numbers() -> None:
     assert MARKERS.bodies.labels(MARKERS) == [(0, None), (1, None)]
     assert TIPS.bodies.labels(TIPS) == [(None, "left"), (None, "right")]
+    assert [list(data.bodies.exchangeable(data)) for data in (MARKERS, TIPS)] == [[0, 1], []]
     single = dc.Measurements.from_poses(Q, POSES[:, 0], doubt=False)
     assert single.bodies.labels(single) == [(None, None)]
     named = TIPS.with_tips(None)
     assert named.bodies.labels(named, TIPS.on) == TIPS.bodies.labels(TIPS)
+
+
+def test_only_markers_can_be_those_of_the_other_hand() -> None:
+    (mirrored,) = MARKERS.bodies.mirrored(MARKERS)
+    assert_close(mirrored[..., :2], MARKERS.points[..., :2])
+    assert_close(mirrored[..., 2], -MARKERS.points[..., 2])
+    assert not list(TIPS.bodies.mirrored(TIPS))
 
 
 def test_turns_are_angles_of_frames() -> None:

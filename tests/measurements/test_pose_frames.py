@@ -137,7 +137,7 @@ def test_frames_in_a_data_frame() -> None:
         (lambda poses: poses.index_fill(0, torch.tensor(4), torch.nan), {}, ("`poses`, row 4: no frame was seen",)),
         (lambda poses: poses.index_fill(1, torch.tensor(1), torch.nan), {}, ("the frame on 'right'", "all 6 rows")),
         (lambda poses: poses * 2, {}, ("`poses`, row 0, frame 0", "[0, 0, 0, 1]")),
-        (lambda poses: poses, {"on": ["left"]}, ("`on`", "expected 3 names", "every measured frame")),
+        (lambda poses: poses, {"on": ["left"]}, ("`on`", "expected 3 names", "per measured frame")),
         (lambda poses: poses, {"position_std": -1.0}, ("`position_std`", "positive")),
     ],
 )

@@ -255,8 +255,7 @@ def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
 def _mirrored(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in a frame of the other hand."""
     words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
-    if data.lever is None:  # a rotation shows the hand
-        mirrored = data.points * data.points.new_tensor([1.0, 1.0, -1.0])
+    for mirrored in data.bodies.mirrored(data):
         yield Reading(robot, data.q, mirrored, words, on=data.on or ())
 
 

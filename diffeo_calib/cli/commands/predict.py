@@ -116,7 +116,7 @@ def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, mass
         q: (B, n) rad or m. masses: (B,) payloads, if they are known.
     """
     model = model if masses is None else model.at_payloads(masses)
-    mean, covariance = model.predict(q) if model.lever is None else model.predict_poses(q)
+    mean, covariance = model.bodies.written(model, q)
     return q, mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt(), readings.cells(model, q)
 
 

@@ -91,8 +91,7 @@ def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = (old.stepped(step).points - old.points).norm(dim=1)
-    count = len(shift) // model.bodies.points
-    what = f"the {'marker' if model.lever is None else 'tool'}{'s' * (count > 1)} on the flange"
+    what = f"{model.bodies.moved_words(len(shift))} on the flange"
     return Motion(what, float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
 
 

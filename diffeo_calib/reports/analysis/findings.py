@@ -236,7 +236,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     large = predictions.errors.median > UNMOVED_MEDIAN_DEVIATIONS * float(predictions.claimed.nanmedian())
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
-    if large or data.lever is not None:  # a turn does not show in the origins
+    if data.bodies.perhaps_moved(far=large):
         named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
