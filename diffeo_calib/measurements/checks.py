@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from math import isnan
 from pathlib import Path
 
@@ -44,6 +45,15 @@ ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / ma
 def angle_mistake(words: str) -> str:
     """Sentence about a wrong unit of joint values."""
     return f"the joint values seem to be {words}; check the angle unit"
+
+
+@contextmanager
+def of_measurements() -> Iterator[None]:
+    """Errors of input within are those of measurements."""
+    try:
+        yield
+    except InputError as error:
+        raise error if isinstance(error, MeasurementError) else MeasurementError(str(error)) from None
 
 
 def in_other_unit(ratio: float, tolerance: float) -> bool:
@@ -111,10 +121,8 @@ def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[s
     """
     if is_data_frame(q):
         chosen = column_names(q) if names is None else [names] if isinstance(names, str) else list(names)
-        try:
+        with of_measurements():
             q = named_columns(q, chosen, "q")
-        except InputError as error:
-            raise MeasurementError(str(error)) from None
         names = [str(name) for name in chosen]
     angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
     check_size(angles, "q")
@@ -230,10 +238,8 @@ def payloads(value: object, q: Tensor) -> Tensor:
 
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
-    try:
+    with of_measurements():
         return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
 
 
 def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
@@ -295,10 +301,8 @@ def marker_places(points: object) -> Tensor:
         MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
     """
     shapes, fix = (("N", "P", 3), ("N", 3)), "pass x, y and z of every marker, in metres"
-    try:
+    with of_measurements():
         raw = real_tensor(points, "points").detach()
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
     empty = raw.isnan() & (raw.ndim == 3 and raw.shape[1] > 1)  # a single marker is in every row
     places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
     if not bool(empty.any()):

@@ -12,18 +12,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,
-    RANGES,
     RowGroups,
     RowTable,
     check_alike,
     common,
-    joint_ranges,
     set_attributes,
 )
 
@@ -117,15 +114,6 @@ class Observations(RowGroups):
         """(N,) int64, number of each row's socket, -1 for other rows."""
         return self._whole([part.socket_numbers for part in self.parts])
 
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""
-        found = [
-            (int(rows[first]), int(rows[second]))
-            for part, rows in zip(self.parts, self.index, strict=True)
-            for first, second in part.copies()
-        ]
-        return sorted(((min(pair), max(pair)) for pair in found), key=lambda pair: pair[1])
-
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint")
         words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
@@ -145,10 +133,6 @@ class Observations(RowGroups):
         whole = pandas.concat(frames).iloc[torch.cat(self.index).argsort().numpy()]
         whole.insert(0, "kind", self.kinds)
         return whole
-
-    def _repr_html_(self) -> str:
-        ranges = [one for part in self.parts for one in part.ranges]
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
 
     def rows(self, index: object) -> Observations:
         """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import real_tensor, wrapped
-from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.checks import check_rows, deviations
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.checks import check_rows, deviations, of_measurements
 from diffeo_calib.measurements.poses import (
     ONE_POSE,
     check_lever,
@@ -178,7 +178,7 @@ def pose_columns(
     Raises:
         MeasurementError: as there.
     """
-    try:
+    with of_measurements():
         frames, board = checked_frames(poses).to(q.device), None
         if camera_on_tool:
             if frames.shape[1] > 1:
@@ -187,8 +187,6 @@ def pose_columns(
                 raise InputError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
             frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
         points = points_of_frames(frames, lever)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
     check_rows(q, frames, "poses")
     known = {"position_std": position_std, "rotation_std": rotation_std}
     std, turns = (_deviations(value, name, frames[..., :3, 3]) for name, value in known.items())

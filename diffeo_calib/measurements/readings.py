@@ -29,7 +29,6 @@ from diffeo_calib.measurements.checks import (
 )
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.splits import exact_copies
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
@@ -328,9 +327,10 @@ class Readings(RowTable):
         names = tip_names(on, 1)
         return with_attributes(self, on=None if names is None else names[0])
 
-    def copies(self) -> list[tuple[int, int]]:
-        """(earlier row, row) for every row that repeats an earlier one exactly, its device included."""
-        return exact_copies(torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1))
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowTable`."""
+        return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
 
 
 def _doubted(data: Readings, doubt: bool) -> Readings:

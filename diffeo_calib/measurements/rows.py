@@ -27,6 +27,7 @@ from diffeo_calib.measurements.splits import (
     PLACES,
     REPEAT_TOLERANCE,
     connected,
+    exact_copies,
     fold_numbers,
     in_train,
     repeat_groups,
@@ -183,8 +184,17 @@ class RowGroups:
         return self.with_columns(origin=origin)
 
     def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        raise NotImplementedError
+        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly.
+
+        Real repeats differ by noise.
+        """
+        pairs = zip(self.parts, self.index, strict=True)
+        found = [sorted(rows[list(pair)].tolist()) for part, rows in pairs for pair in exact_copies(part.compared)]
+        return sorted(((first, second) for first, second in found), key=lambda pair: pair[1])
+
+    def _repr_html_(self) -> str:
+        ranges = [one for part in self.parts for one in part.ranges]
+        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
 
     @property
     def masses(self) -> Tensor:
@@ -357,12 +367,14 @@ class RowTable(RowGroups):
         raise NotImplementedError
 
     @property
+    def compared(self) -> Tensor:
+        """(N, c) numbers in which a row that repeats another one equals it."""
+        raise NotImplementedError
+
+    @property
     def ranges(self) -> list[list[str]]:
         """Column, smallest and largest value and their unit, of what was measured."""
         raise NotImplementedError
-
-    def _repr_html_(self) -> str:
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + self.ranges)
 
     def warn_if_suspicious(self) -> None:
         """Warn about exact copies of rows, and about joint values that look like degrees."""

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.errors import MeasurementError, as_written
+from diffeo_calib.measurements.checks import of_measurements
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
@@ -99,10 +100,8 @@ def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) 
 
 def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes (G,) of the groups, and their numbers (G,) in random order."""
-    try:
+    with of_measurements():
         checked_seed = check_seed(seed)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
         together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"

@@ -47,7 +47,6 @@ from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
-from diffeo_calib.measurements.splits import exact_copies
 
 
 @methods_outside_inference_mode
@@ -333,9 +332,10 @@ class Measurements(ImageTable):
         """(N,) name of the set-up in which each row was measured, "" without one."""
         return texts_of(self.session, self.session_names, len(self))
 
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowTable`."""
+        return torch.cat([self.q, self.points.flatten(1)], dim=1)
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")

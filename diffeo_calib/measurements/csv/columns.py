@@ -17,6 +17,7 @@ from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,
     TableFormat,
+    by_frame,
     check_choice,
     column_names,
     flat_names,
@@ -254,7 +255,7 @@ def _check_frames(table: TableFormat, positions: int) -> None:
     """Raise MeasurementError unless every rotation has its position, and every deviation its rotation."""
     deviations = None if len(flat_names(table.rotation_std)) == 1 else table.rotation_std  # one for all frames
     for name, names in (("rotation", table.rotation), ("rotation_std", deviations)):
-        count = 0 if not names else 1 if isinstance(names[0], str) else len(names)
+        count = len(names or ())
         if count not in (0, positions):
             got = f"{positions} triples and {count} {'list' if count == 1 else 'lists'} of columns in `{name}`"
             fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
@@ -263,17 +264,8 @@ def _check_frames(table: TableFormat, positions: int) -> None:
 
 
 def position_triples(position: Names) -> list[tuple[str, ...]]:
-    """Return one (x, y, z) triple of column names per marker.
-
-    Raises:
-        MeasurementError: not three names per marker.
-    """
-    groups = [position] if all(isinstance(name, str) for name in position) else position
-    triples = [() if isinstance(group, str) else tuple(group) for group in groups]
-    if not triples or not all(len(t) == 3 and all(isinstance(name, str) for name in t) for t in triples):
-        expected, fix = "three names of columns", "pass ('x', 'y', 'z'), or one such triple per marker"
-        raise MeasurementError.of("`position`", expected=expected, got=as_written(position), fix=fix)
-    return [tuple(str(name).strip() for name in triple) for triple in triples]
+    """Return one (x, y, z) triple of column names per marker; MeasurementError without three names for each."""
+    return list(by_frame("position", position, "three names of columns for each marker", 3))
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

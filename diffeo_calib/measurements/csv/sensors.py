@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
-from diffeo_calib.measurements.checks import unlikely_units
+from diffeo_calib.common.errors import MeasurementError, warn_user
+from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import BadCells
 from diffeo_calib.measurements.csv.columns import (
     DEVIATION,
@@ -185,10 +185,8 @@ def _rotations(rows: FileRows, convention: str) -> Tensor:
         return f"file '{rows.path}', line {lines[row]}, columns {', '.join(own)}"
 
     found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
-    try:
+    with of_measurements():
         found[seen] = rotation_matrices(numbers[seen], convention, angle=columns.rotation_unit, place=place)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
     return found
 
 
