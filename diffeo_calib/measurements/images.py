@@ -148,13 +148,18 @@ class ImageTable(SocketTable):
         return self._pose_slopes() @ self.pose_larger
 
     def errors_along(self, R: Tensor) -> dict[str, object]:
-        """Errors of poses along axes turned by R (N, 3, 3)."""
+        """Known errors along axes turned by R (N, 3, 3), as if those of the coordinates were independent."""
+        found: dict[str, object] = {}
+        for name in ("std", "rotation_std"):
+            own = getattr(self, name)
+            if own is not None:
+                found[name] = (own.view(len(self), -1, 3).square() @ R.square().mT).sqrt().view_as(own)
         if self.pose_covariance is None or self.pose_shared is None or self.pose_larger is None:
-            return {}
+            return found
         axes = torch.zeros_like(self.pose_covariance)
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
-        found = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
-        return dict(zip(OF_POSES, found, strict=True))
+        of_poses = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
+        return found | dict(zip(OF_POSES, of_poses, strict=True))
 
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
@@ -179,11 +184,6 @@ class ImageTable(SocketTable):
         R, frames = M[:, :3, :3], self.frames @ torch.linalg.inv(M)[:, None]
         changes = ONE_SESSION | {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
         changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
-        for name in ("std", "rotation_std"):
-            known = getattr(self, name)
-            if known is not None:
-                turned = (R.square() @ known.view(len(self), 3, 1).square()).sqrt()
-                changes[name] = turned.view_as(known)
         return with_attributes(self, **changes, **self.errors_along(R))
 
     def _pose_slopes(self) -> Tensor:

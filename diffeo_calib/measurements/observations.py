@@ -179,14 +179,14 @@ def joined_tables(tables: Sequence[Any]) -> Any:
     return found if len(found.parts) > 1 else part.rows(rows.argsort())
 
 
-class _Piece(NamedTuple):
+class Rows(NamedTuple):
     """A table of one kind, or a mixture of positions and sockets, and its row numbers (M,) in the whole."""
 
     table: Any
     rows: Tensor
 
 
-def _pieces(tables: Sequence[Any]) -> list[_Piece]:
+def _pieces(tables: Sequence[Any]) -> list[Rows]:
     """The parts of all tables, numbered one table after another."""
     given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
     if not given:
@@ -197,18 +197,18 @@ def _pieces(tables: Sequence[Any]) -> list[_Piece]:
             raise MeasurementError.of("tables to join", expected=expected, got=got)
     found, start = [], 0
     for table in given:
-        found += [_Piece(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
+        found += [Rows(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
         start += len(table)
     return found
 
 
-def _observations(pieces: Sequence[_Piece]) -> Observations:
+def _observations(pieces: Sequence[Rows]) -> Observations:
     """The pieces as observations, those of the same kind as one part."""
     _check_joinable([piece.table for piece in pieces])
-    groups: dict[object, list[_Piece]] = {}
-    whole = [_Piece(*pure) for piece in pieces for pure in unmixed(*piece)]
+    groups: dict[object, list[Rows]] = {}
+    whole = [Rows(*pure) for piece in pieces for pure in unmixed(*piece)]
     if any("corners" in piece.table.columns for piece in whole):
-        whole = [_Piece(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
+        whole = [Rows(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
     for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
     parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]

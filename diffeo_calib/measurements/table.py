@@ -469,9 +469,4 @@ class Measurements(ImageTable):
         changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses
-        if self.std is not None and self.board is None:
-            changes["std"] = (self.std.square() @ R.square().mT).sqrt()
-        if self.rotation_std is not None and self.board is None:
-            variances = self.rotation_std.view(len(self), -1, 3).square()
-            changes["rotation_std"] = (variances @ R.square().mT).sqrt().view_as(self.rotation_std)
         return with_attributes(self, **changes)

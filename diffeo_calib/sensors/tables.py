@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.measurements.observations import Observations, unmixed
+from diffeo_calib.measurements.observations import Observations, Rows, unmixed
 from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
@@ -19,25 +18,8 @@ from diffeo_calib.sensors.kinds import kind_of
 ORDER = {"position": 0, "pose": 0, "socket": 1}
 
 
-class Coordinates(NamedTuple):
-    """Rows that tell coordinates: positions, poses, a ball in sockets; and their numbers (M,) in the whole table."""
-
-    table: Measurements
-    rows: Tensor
-
-
-class OtherReadings(NamedTuple):
-    """Readings of one kind, and their numbers (M,) in the whole table."""
-
-    table: Readings
-    rows: Tensor
-
-
-class Rows(NamedTuple):
-    """Rows of one kind, and their numbers (M,) in the whole table."""
-
-    table: Any
-    rows: Tensor
+Coordinates = OtherReadings = Rows
+"""Rows that tell coordinates, of positions, poses and a ball in sockets; readings of one kind."""
 
 
 def rows_of_one_kind(data: Any) -> list[Rows]:

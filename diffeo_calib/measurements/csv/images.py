@@ -80,7 +80,7 @@ class ImageColumns(SensorColumns):
         named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
         named |= {} if self.device is None else {self.device: part.device_names}
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
-        return Written({POINT: seen[:, :2], PIXEL: seen[:, 3:]}, texts, number)
+        return {POINT: seen[:, :2], PIXEL: seen[:, 3:]}, texts, number
 
     def _images(self, rows: FileRows) -> dict[str, list[int]]:
         """The lines of each image, by its name with that of its camera."""

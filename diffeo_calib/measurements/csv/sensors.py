@@ -84,12 +84,8 @@ class FileRows(NamedTuple):
         return self.named(column, expected, fix)
 
 
-class Written(NamedTuple):
-    """Rows as lines of a file: numbers in SI, and texts; ``rows``: (M,) that of each line."""
-
-    values: Mapping[Any, Tensor | None]
-    texts: Mapping[str, Sequence[str]]
-    rows: Tensor
+Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
+"""Rows as lines of a file: numbers in SI by what they are, texts by their column, and the row (M,) of each line."""
 
 
 class SensorColumns:
@@ -169,7 +165,7 @@ class PositionColumns(SensorColumns):
             numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
             values |= {"rotations": numbers, "rotation_std": part.rotation_std}
         texts = {} if self.session is None else {self.session: part.device_names}
-        return Written(values, texts, *part.index)
+        return values, texts, *part.index
 
 
 def _rotations(rows: FileRows, convention: str) -> Tensor:
@@ -229,7 +225,7 @@ class SocketColumns(SensorColumns):
 
     def written(self, part: Any, table: TableFormat) -> Written:
         """See :class:`SensorColumns`."""
-        return Written({}, {self.names[0]: part.row_sockets}, *part.index)
+        return {}, {self.names[0]: part.row_sockets}, *part.index
 
 
 @dataclass(frozen=True)
@@ -310,7 +306,7 @@ class ReadingColumns(SensorColumns):
     def written(self, part: Any, table: TableFormat) -> Written:
         """See :class:`SensorColumns`."""
         values = {self.values: part.reported} | ({self.std: part.reported_std} if self.std else {})
-        return Written(values, {} if self.device is None else {self.device: part.device_names}, *part.index)
+        return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,7 +20,7 @@ from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.poses import LEVER
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ Progress = Callable[[float], object]
 """Called with the fraction of the file that has been read."""
 
 
-class TableFile:
+class TableFile(CsvLines):
     """A CSV file with columns in known units, used as a context.
 
     It can be read as a whole (:meth:`read`), or in two passes for joint values that do not fit in memory: :meth:`check`
@@ -107,15 +106,8 @@ class TableFile:
     """
 
     def __init__(self, path: Path, columns: Columns, texts: Mapping[str, bool] = {}) -> None:  # not changed
-        self.path, self.columns, self.texts, self.rows = path, columns, texts, 0
-        self._file = CsvLines(path, columns.table.sep)
-
-    def __enter__(self) -> Self:
-        self._file.__enter__()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
-        self._file.__exit__(kind, value, trace)
+        super().__init__(path, columns.table.sep)
+        self.columns, self.texts, self.rows = columns, texts, 0
 
     def read(self) -> tuple[Values, dict[str, list[str]], list[int]]:
         """The numbers and the texts of all rows, and the line number of each.
@@ -138,7 +130,7 @@ class TableFile:
             if each is not None:
                 each(self.columns.to_si(block.numbers))
             if progress is not None:
-                progress(self._file.progress)
+                progress(self.progress)
 
     def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
         """Joint values (B, n) [rad or m] of every block, and payloads (B,) if there are some, after :meth:`check`."""
@@ -154,7 +146,7 @@ class TableFile:
     def _numbers(self) -> Iterator[Block]:
         columns = self.columns
         given = columns.names, columns.table.decimal, ROWS_AT_ONCE, columns.hideable
-        return number_blocks(self._file, *given, texts=self.texts, all_hidden=columns.all_hidden)
+        return number_blocks(self, *given, texts=self.texts, all_hidden=columns.all_hidden)
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
