@@ -186,16 +186,18 @@ class SocketTable(RowTable):
         distances = tuple((new[a], new[b], d) for a, b, d in self.sockets.distances if a in new and b in new)
         return with_attributes(self, socket=numbers, sockets=Sockets(names, distances, self.sockets.distance_std))
 
-    def with_hidden_ball(self) -> Self:
-        """Measured positions with a ball that no row shows as their last marker."""
+    def with_markers(self, count: int) -> Self:
+        """The rows with this many markers, the ball last: those that rows of one kind do not show are hidden."""
+        if self.sockets is not None:
+            lacking = count - 1 if self.markers == 1 else 0
+            changes: dict[str, object] = {"marker_names": None, "on": None} if lacking else {}
+            return with_attributes(self, points=_padded(self.points, lacking, 0), **changes)
+        if self.markers != count - 1:
+            return self
         names = self.marker_names and (*self.marker_names, BALL)
         changes = {"marker_names": names, "on": self.on and (*self.on, self.on[-1])}
         std = None if self.std is None else _padded(self.std, 0, 1)
         return with_attributes(self, points=_padded(self.points, 0, 1), std=std, **changes)
-
-    def with_hidden_markers(self, markers: int) -> Self:
-        """Rows in sockets with this many markers before the ball that no row shows."""
-        return with_attributes(self, points=_padded(self.points, markers, 0), marker_names=None, on=None)
 
     @classmethod
     def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
@@ -204,23 +206,21 @@ class SocketTable(RowTable):
         known = [table for table in tables if table.sockets is not None]
         if not known or (not device and len({table.markers for table in tables}) == 1):
             return super().of_one_layout(tables)
-        both = device[0].with_hidden_ball() if device else max(known, key=lambda table: table.markers)
-        none = [torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST) for table in tables]
-        shown = [table._beside(both, known[0].sockets, own) for table, own in zip(tables, none, strict=True)]
-        return super().of_one_layout(shown)
-
-    def _beside(self, other: SocketTable, sockets: Sockets | None, none: Tensor) -> Self:
-        """The rows with the markers of other rows, hidden where these rows do not have them; ``none``: (N,) of -1."""
-        if self.sockets is None:
-            return with_attributes(self.with_hidden_ball(), socket=none, sockets=sockets)
-        if self.markers > 1:
-            return self
-        shown = self.with_hidden_markers(other.markers - 1)
-        changes: dict[str, object] = {"marker_names": other.marker_names, "on": other.on}
-        changes |= {} if other.std is None else {"std": torch.full_like(shown.points, torch.nan)}
-        changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
-        changes["remounted"] = other.remounted
-        return with_attributes(shown, **changes)
+        most = max(known, key=lambda table: table.markers)
+        both = device[0].with_markers(device[0].markers + 1) if device else most
+        found = []
+        for table in tables:
+            none = torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST)
+            shown = table.with_markers(both.markers if table.sockets is not None else table.markers + 1)
+            changes: dict[str, object] = {}
+            if table.sockets is None:
+                changes = {"socket": none, "sockets": known[0].sockets}
+            elif table.markers == 1:
+                changes = {"marker_names": both.marker_names, "on": both.on, "remounted": both.remounted}
+                changes |= {} if both.std is None else {"std": torch.full_like(shown.points, torch.nan)}
+                changes |= {} if both.session is None else {"session": none, "session_names": both.session_names}
+            found.append(with_attributes(shown, **changes))
+        return super().of_one_layout(found)
 
 
 def socket_numbers(

@@ -120,7 +120,7 @@ class Positions(Sensor):
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With a hidden ball where the model has one more point."""
-        return data.with_hidden_ball() if model.ball and data.markers == model.markers - 1 else data
+        return data.with_markers(model.markers) if model.ball else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of set-ups: those that the model knows stay, the others are found.
@@ -222,7 +222,7 @@ class Contacts(Sensor):
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With hidden markers before the ball."""
         self.check(data, model)
-        return data.with_hidden_markers(model.markers - 1) if data.markers == 1 < model.markers else data
+        return data.with_markers(model.markers)
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""

@@ -47,10 +47,7 @@ def with_markers(table: Measurements, markers: int, lever: float | None = None) 
     """
     if table.frames is not None and lever is not None:
         table = with_attributes(table, points=points_of_frames(table.frames, lever), lever=lever)
-    if table.sockets is not None:
-        table = table.with_sockets_of_rows()
-        return table.with_hidden_markers(markers - 1) if table.markers == 1 < markers else table
-    return table.with_hidden_ball() if table.markers == markers - 1 else table
+    return table.with_sockets_of_rows().with_markers(markers)
 
 
 def measured_rows(table: Measurements) -> Coordinates | None:
