@@ -310,8 +310,9 @@ class Body:
     @property
     def from_old(self) -> Tensor:
         """(d,) the unknowns that lead from the old places to the present ones, to first order at the present."""
-        turn = rotation_numbers(self.turn, "rotvec").to(self.shift.device)
-        return torch.cat([self.shift, turn], 1)[:, : self._numbers].flatten()
+        if self.lever is None:
+            return self.shift.flatten()
+        return torch.cat([self.shift, rotation_numbers(self.turn, "rotvec").to(self.shift.device)], 1).flatten()
 
     def stepped(self, step: Tensor) -> Body:
         """After a step (d,) of the unknowns."""

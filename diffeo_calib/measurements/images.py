@@ -125,11 +125,6 @@ class ImageTable(SocketTable):
         return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
 
     @property
-    def same_tool(self) -> bool:
-        """Whether the set-ups are cameras, between which nothing on the tool was mounted again."""
-        return set(self.session_names) <= set(self.cameras)
-
-    @property
     def sees_board_from_tool(self) -> bool | None:
         """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board."""
         return True if self.board is not None else False if self.cameras else None

@@ -135,12 +135,7 @@ class Observations(RowGroups):
         return whole
 
     def rows(self, index: object) -> Observations:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
+        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         parts, numbers = [], []
         for part, own in zip(self.parts, self.index, strict=True):

@@ -19,7 +19,6 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
-    chosen_rows,
     copied,
     deviations,
     joint_table,
@@ -312,13 +311,8 @@ class Readings(RowTable):
         return [value_range(*one, unit) for one in zip(self.value_names, self.reported.T, strict=True)]
 
     def rows(self, index: object) -> Readings:
-        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order, and their devices.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
-        found = super().rows(chosen_rows(index, len(self)))
+        """See :class:`RowGroups`; the devices are those of these rows."""
+        found = super().rows(index)
         used, numbers = found.device.unique(return_inverse=True)
         return with_attributes(found, device=numbers, names=tuple(self.names[number] for number in used.tolist()))
 

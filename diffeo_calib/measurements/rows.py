@@ -103,7 +103,12 @@ class RowGroups:
         return (self.rows(i) for i in range(len(self)))
 
     def rows(self, index: object) -> Self:
-        """Some of the rows."""
+        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
         raise NotImplementedError
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
@@ -335,12 +340,7 @@ class RowTable(RowGroups):
         return [(self, *self.index)]
 
     def rows(self, index: object) -> Self:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
+        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 

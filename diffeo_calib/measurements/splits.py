@@ -20,11 +20,7 @@ CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
 
 
 def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
-    """Label repeated configurations: (N, n) -> (N,) int64 labels 0, 1, ... in the order of first appearance.
-
-    The first row without a group leads a new one, which takes all later rows without a group that are within
-    ``tolerance`` of the leader in every joint. Rows along a slow trajectory thus do not chain into a single group.
-    """
+    """Labels (N,) of repeated configurations (N, n), see :meth:`RowGroups.groups`."""
     from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
 
     check_number(tolerance, "`tolerance`", above=-1e-300)

@@ -48,6 +48,8 @@ from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
 
+XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
+
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -353,21 +355,14 @@ class Measurements(ImageTable):
         return f"Measurements({', '.join(parts)})"
 
     @property
-    def position_names(self) -> list[tuple[str, ...]]:
-        """Columns x, y, z of each marker or frame: NAME_x, ... of several, TIP_x, ... of frames; none for a ball."""
-        if self.poses is not None:
-            return [(f"{prefix}x", f"{prefix}y", f"{prefix}z") for prefix in self.frame_prefixes]
-        measured = self.markers - (self.sockets is not None)
-        if measured == 1 and self.marker_names is None:
-            return [("x", "y", "z")]
-        markers = (self.marker_names or [f"marker{k + 1}" for k in range(measured)])[:measured]
-        return [(f"{name}_x", f"{name}_y", f"{name}_z") for name in markers]
-
-    @property
-    def frame_prefixes(self) -> list[str]:
-        """Prefix of the columns of each measured frame: empty for a single one, else TIP_."""
-        frames = 0 if self.frames is None else self.frames.shape[1]
-        return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+    def prefixes(self) -> list[str]:
+        """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_; not of a ball."""
+        if self.frames is not None:
+            frames = self.frames.shape[1]
+            return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+        seen = self.markers - (self.sockets is not None)
+        plain = [""] if seen == 1 else [f"marker{k + 1}_" for k in range(seen)]
+        return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names[:seen]]
 
     def measured(self) -> dict[str, Any]:
         """Sockets, positions and rotation vectors rx, ry, rz, known standard deviations as std_x, ..., and sessions.
@@ -376,8 +371,7 @@ class Measurements(ImageTable):
         camera's axes.
         """
         columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
-        names = [name for triple in self.position_names for name in triple]
-        turns = [f"{prefix}{name}" for prefix in self.frame_prefixes for name in ("rx", "ry", "rz")]
+        names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
             columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)

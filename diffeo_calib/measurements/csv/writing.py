@@ -257,7 +257,7 @@ def _sheet(
     if device is not None and device.corners is not None:
         device, table = None, replace(table, camera_on_tool=False)
     if device is not None:
-        triples = position_triples(position or device.position_names)
+        triples = position_triples(position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes])
         table = replace(_with_names(device, table, triples), remounted=device.remounted)
     if whole.payload is not None and table.payload is None:
         table = replace(table, payload=PAYLOAD)
@@ -285,7 +285,7 @@ def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -
     bodies = data.seen_bodies.shape[1]
     check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
     if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.frame_prefixes)
+        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.prefixes)
     if data.std is None:
         return table
     std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
