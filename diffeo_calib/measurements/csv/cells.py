@@ -13,7 +13,7 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
@@ -166,54 +166,6 @@ _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
 
 
-def number_blocks(
-    file: CsvLines,
-    wanted: Sequence[str],
-    decimal: str,
-    rows: int,
-    hideable: Sequence[Hideable] = (),
-    *,
-    texts: Mapping[str, bool] = {},  # not changed
-    all_hidden: bool = False,
-) -> Iterator[Block]:
-    """Read some columns of a CSV file in blocks of rows.
-
-    Args:
-        file: the file, with one header line.
-        wanted: names of c columns of numbers.
-        decimal: ``"."`` or ``","``.
-        rows: most rows of a block.
-        hideable: the columns that rows may hide: not all of them in one row, unless ``all_hidden``.
-        texts: names of columns of texts, and whether the file must have them; "nan" is an empty text.
-
-    Yields:
-        finite numbers as written in the file; nothing more from the first block with a mistake on.
-
-    Raises:
-        MeasurementError: anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the whole
-            file first.
-    """
-    named = [name for name, needed in texts.items() if needed or name in file.header]
-    places = _find_columns(file.path, file.header, [*wanted, *named], file.sep)
-    mistakes = _Mistakes(file.path, wanted, decimal, markers=len(hideable))
-    for lines in file.blocks(rows):
-        whole = mistakes.without_ragged(lines, len(file.header))
-        cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]
-        numbers, hidden = _parse(cells, decimal), []
-        if numbers is None and hideable:
-            hidden = _fill_hidden(cells, hideable, all_hidden=all_hidden)
-            numbers = _parse(cells, decimal)
-        if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
-            mistakes.add([line for line, _ in whole], cells)
-        elif not mistakes:
-            if hidden:
-                numbers[tuple(zip(*hidden, strict=True))] = math.nan
-            own = zip(named, places[len(wanted) :], strict=True)
-            found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
-            yield Block(numbers, found, [line for line, _ in lines])
-    mistakes.raise_first()
-
-
 def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
     """Read a CSV file as text: the header, and number and cells of every line below it that is not blank.
 
@@ -222,7 +174,7 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
     """
     with CsvLines(path, sep) as file:
         lines = [line for block in file.blocks(LONGEST_LINE) for line in block]
-        mistakes = _Mistakes(path, (), ".")
+        mistakes = Mistakes(path, (), ".")
         mistakes.without_ragged(lines, len(file.header))
         mistakes.raise_first()
         return file.header, lines
@@ -261,7 +213,7 @@ class BadCells:
         return MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
 
-class _Mistakes:
+class Mistakes:
     """Faults in the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
 
     def __init__(self, path: Path, wanted: Sequence[str], decimal: str, markers: int = 0) -> None:
@@ -305,7 +257,7 @@ class _Mistakes:
             raise self.missing.error(self.path, expected, f"remove or repair these lines{hint}")
 
 
-def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
+def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
     """Return the position of every wanted column in the header."""
     missing = [name for name in wanted if name not in header]
     if missing and header[0].startswith("#"):
@@ -359,7 +311,7 @@ def _bare(name: str) -> str:
     return lowered.replace("joint", "").replace("_", "") or lowered
 
 
-def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:
+def fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:
     """Write zeros into the cells of hidden markers, in place, and return their places (row, column)."""
     filled = []
     for number_of_row, cells in enumerate(rows):
@@ -374,7 +326,7 @@ def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hid
     return filled
 
 
-def _parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
+def parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
     """The numbers of cells, (B, c); None if some are none, or look like none."""
     if not rows:
         return torch.empty(0, 0, dtype=torch.float64, device=HOST)

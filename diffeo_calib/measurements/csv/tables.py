@@ -15,7 +15,18 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.cells import BadCells, Block, CsvLines, number, number_blocks, read_cells
+from diffeo_calib.measurements.csv.cells import (
+    LARGEST_NUMBER,
+    BadCells,
+    Block,
+    CsvLines,
+    Mistakes,
+    fill_hidden,
+    find_columns,
+    number,
+    parse,
+    read_cells,
+)
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.poses import LEVER
 
@@ -98,8 +109,8 @@ class TableFile(CsvLines):
 
     Args:
         path: the file.
-        columns: which columns of numbers it has, and their units. texts: columns of texts, and whether it must have
-            them.
+        columns: which columns of numbers it has, and their units. texts: columns of texts, "nan" being empty, and
+            whether it must have them.
 
     Attributes:
         rows: number of rows; 0 before the first pass.
@@ -113,8 +124,7 @@ class TableFile(CsvLines):
         """The numbers and the texts of all rows, and the line number of each.
 
         Raises:
-            MeasurementError: any mistake in the file, see :func:`number_blocks`; standard deviations that are not
-                positive, negative payloads.
+            MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
         Warns:
             DiffeoCalibWarning: values that look as if they were in another unit.
@@ -144,9 +154,31 @@ class TableFile(CsvLines):
             raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
-        columns = self.columns
-        given = columns.names, columns.table.decimal, ROWS_AT_ONCE, columns.hideable
-        return number_blocks(self, *given, texts=self.texts, all_hidden=columns.all_hidden)
+        """Numbers as written in the file, in blocks; nothing more from the first block with a mistake on.
+
+        MeasurementError for anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the
+        whole file first.
+        """
+        wanted, decimal, hideable = self.columns.names, self.columns.table.decimal, self.columns.hideable
+        named = [name for name, needed in self.texts.items() if needed or name in self.header]
+        places = find_columns(self.path, self.header, [*wanted, *named], self.sep)
+        mistakes = Mistakes(self.path, wanted, decimal, markers=len(hideable))
+        for lines in self.blocks(ROWS_AT_ONCE):
+            whole = mistakes.without_ragged(lines, len(self.header))
+            cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]
+            numbers, hidden = parse(cells, decimal), []
+            if numbers is None and hideable:
+                hidden = fill_hidden(cells, hideable, all_hidden=self.columns.all_hidden)
+                numbers = parse(cells, decimal)
+            if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
+                mistakes.add([line for line, _ in whole], cells)
+            elif not mistakes:
+                if hidden:
+                    numbers[tuple(zip(*hidden, strict=True))] = math.nan
+                own = zip(named, places[len(wanted) :], strict=True)
+                found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
+                yield Block(numbers, found, [line for line, _ in lines])
+        mistakes.raise_first()
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
