@@ -262,3 +262,14 @@ def test_poses_beside_sockets_and_payloads(tmp_path: Path) -> None:
     assert isinstance(found, Observations)
     assert found.kinds == ("pose", "socket")
     assert held(found.payload).tolist() == [1.0, 2.0]
+
+
+def test_kinds_share_a_column_of_deviations_in_one_unit_alone(tmp_path: Path) -> None:
+    text = "a,b,d,h,sd,who\n0,1,5,,0.1,A\n1,2,,7,0.2,B\n"
+    wire = ReadingColumns("distance", ("d",), "who", std=("sd",))
+    plane = replace(wire, kind="height", values=("h",))
+    data = read(tmp_path, text, TableColumns(NAMES, readings=(wire, plane)))
+    assert [held(part.std).tolist() for part in data.parts] == [[[0.1]], [[0.2]]]
+    angle = replace(plane, kind="angle", unit=("mrad", 1e3))
+    with pytest.raises(MeasurementError, match=says("distinct columns", "'sd'")):
+        read(tmp_path, text, TableColumns(NAMES, readings=(wire, angle)))

@@ -41,7 +41,7 @@ class ChainLike(Protocol):
 
 
 Values = dict[Any, Tensor]
-"""Numbers of the rows of a table in SI by what they are, readings by their columns; rotations are as in the file."""
+"""Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`; rotations are as in the file."""
 
 
 class Check(NamedTuple):
@@ -64,7 +64,7 @@ class Group(NamedTuple):
         check: what the numbers are expected to be.
     """
 
-    names: Sequence[str]
+    names: tuple[str, ...]
     unit: str | float | None = None
     check: Check | None = None
 
@@ -157,17 +157,15 @@ class Columns:
 
     @property
     def groups(self) -> dict[Any, Group]:
-        """All columns by what they hold, joints first; readings by the names of their columns."""
-        table, positions = self.table, [name for triple in self.triples for name in triple]
+        """All columns by what they hold, joints first; those of readings by themselves."""
+        table, positions = self.table, tuple(name for triple in self.triples for name in triple)
         found = {"q": Group(self.joints), "points": Group(positions, table.length), "rotations": Group(self.rotation)}
-        found |= {name: Group([column]) for name, column in table.covariates.items()}
-        found |= {} if table.payload is None else {"payload": Group([table.payload.strip()], None, MASS)}
+        found |= {name: Group((column,)) for name, column in table.covariates.items()}
+        found |= {} if table.payload is None else {"payload": Group((table.payload.strip(),), None, MASS)}
         found["std"] = Group(self.std, table.length, DEVIATION)
         found["rotation_std"] = Group(self.rotation_std, self.rotation_unit, DEVIATION)
         own = [group for one in self.readings for group in (one.values, one.std)]
-        return {name: group for name, group in found.items() if group.names} | {
-            tuple(g.names): g for g in own if g.names
-        }
+        return {key: group for key, group in (*found.items(), *zip(own, own, strict=True)) if group.names}
 
     @property
     def names(self) -> list[str]:

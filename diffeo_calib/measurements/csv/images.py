@@ -59,7 +59,7 @@ class ImageColumns(SensorColumns):
         """See :class:`SensorColumns`."""
         images = self._images(rows)
         _check_joints(rows, images)
-        points, pixels = rows.values[POINT], rows.values[PIXEL]
+        points, pixels = (rows.values[one.values] for one in self.reported(rows.columns.table))
         flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
         corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
         for number, own in enumerate(images.values()):
@@ -80,7 +80,8 @@ class ImageColumns(SensorColumns):
         named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
         named |= {} if self.device is None else {self.device: part.device_names}
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
-        return {POINT: seen[:, :2], PIXEL: seen[:, 3:]}, texts, number
+        points, pixels = (one.values for one in self.reported(table))
+        return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
 
     def _images(self, rows: FileRows) -> dict[str, list[int]]:
         """The lines of each image, by its name with that of its camera."""

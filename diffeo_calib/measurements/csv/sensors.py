@@ -271,7 +271,7 @@ class ReadingColumns(SensorColumns):
     def filled(self, rows: FileRows) -> Tensor:
         """See :class:`SensorColumns`."""
         if isinstance(self.values, tuple):
-            return ~rows.values[self.values].isnan().any(1)
+            return ~rows.values[self.reported(rows.columns.table)[0].values].isnan().any(1)
         if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
@@ -286,11 +286,11 @@ class ReadingColumns(SensorColumns):
             self.reported(rows.columns.table),
         )
         if isinstance(self.values, tuple):
-            seen = rows.values[self.values]
+            seen = rows.values[own.values]
         else:
             seen = own.values.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.values[self.std].expand_as(seen) if self.std else None
+        std = rows.values[own.std].expand_as(seen) if self.std else None
         given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
         if self.kind == "image":
             data = Readings.images(*given, focal=self.intrinsics[:2], centre=self.intrinsics[2:], **known)
@@ -305,7 +305,8 @@ class ReadingColumns(SensorColumns):
 
     def written(self, part: Any, table: TableFormat) -> Written:
         """See :class:`SensorColumns`."""
-        values = {self.values: part.reported} | ({self.std: part.reported_std} if self.std else {})
+        (own,) = self.reported(table)
+        values = {own.values: part.reported} | ({own.std: part.reported_std} if self.std else {})
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
