@@ -25,6 +25,7 @@ from diffeo_calib.measurements.checks import (
     deviations,
     joint_table,
     marker_places,
+    of_measurements,
     seen_markers,
     session_numbers,
     texts_of,
@@ -36,10 +37,12 @@ from diffeo_calib.measurements.pose_frames import (
     POINTS,
     block_diagonal,
     by_frame,
+    checked_frames,
     frame_tips,
     frames_of_points,
+    inverse_poses,
     of_frames,
-    pose_columns,
+    points_of_frames,
     pose_jacobian,
     visible_rotation_numbers,
 )
@@ -167,9 +170,26 @@ class Measurements(ImageTable):
                 standard deviation that is not positive.
         """
         angles, joints = joint_table(q, joint_names)
-        columns = pose_columns(angles, poses, lever, position_std, rotation_std, camera_on_tool=camera_on_tool)
-        data = cls(angles, columns["points"], joints, doubt=False)
-        data = with_attributes(data, **columns, lever=float(lever)).with_tips(on)
+        with of_measurements():
+            frames, board = checked_frames(poses).to(angles.device), None
+            if camera_on_tool:
+                if frames.shape[1] > 1:
+                    what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
+                    fix += " poses of the cameras in the board's frame"
+                    raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
+                frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
+            points = points_of_frames(frames, lever)
+        check_rows(angles, frames, "poses")
+        places = frames[..., :3, 3]
+        like = places if places.shape[1] > 1 else places[:, 0]
+        known = deviations(position_std, "position_std", like)
+        std, turns = (
+            known if known is None else known.view(places.shape),
+            deviations(rotation_std, "rotation_std", like),
+        )
+        data = cls(angles, points, joints, doubt=False)
+        found = {"poses": of_frames(frames), "lever": float(lever), "board": board, "std": std, "rotation_std": turns}
+        data = with_attributes(data, **found).with_tips(on)
         if doubt:
             data.check_every_marker_seen()
             data.warn_if_suspicious()
