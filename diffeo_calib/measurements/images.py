@@ -93,10 +93,26 @@ class ImageTable(SocketTable):
         angles, joints = joint_table(q, joint_names)
         numbers, names = session_numbers(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
-        seen = image_columns(angles, corners, numbers, known, board, camera_on_tool=camera_on_tool)
+        given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
+        if given.ndim != 3 or given.shape[2] != 5:
+            fix = (
+                "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
+            )
+            raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
+        check_rows(angles, given, "corners")
+        given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
+        own = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
+        found = _sights([given[own == number] for number in range(len(known))], known, board)
+        order = torch.cat([(own == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
+        poses, *errors = (
+            torch.cat([getattr(one, name) for one in found])[order] for name in ("poses", "covariance", "shared")
+        )
         named = {"camera_on_tool": camera_on_tool, "doubt": doubt}
-        found = with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
-        return found.with_sessions(seen_by, remounted=camera_on_tool)
+        cameras = dict(zip(known, (one.camera for one in found), strict=True))
+        columns = {"corners": given, "cameras": cameras, "seen_by": own}
+        columns |= errors_of_poses(poses, *errors, camera_on_tool=camera_on_tool)
+        data = with_attributes(cls.from_poses(angles, poses, joints, **named), **columns)
+        return data.with_sessions(seen_by, remounted=camera_on_tool)
 
     @property
     def camera(self) -> Camera | None:
@@ -215,40 +231,20 @@ def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
     return found
 
 
-def image_columns(
-    q: Tensor,
-    corners: object,
-    seen_by: Tensor | None,
-    known: Mapping[str, Known],
-    board: BoardPrior | None,
-    *,
-    camera_on_tool: bool,
-) -> dict[str, Any]:
-    """The columns of :meth:`Measurements.from_images`, poses among them; arguments and errors as there."""
-    given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
-    if given.ndim != 3 or given.shape[2] != 5:
-        fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
-        raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
-    check_rows(q, given, "corners")
-    given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
-    seen_by = torch.zeros(len(q), dtype=torch.int64, device=HOST) if seen_by is None else seen_by
+def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardPrior | None) -> Sequence[Sights]:
+    """What each camera saw, of its corners (N_i, K, 5); a warning or an error about one that saw it otherwise."""
     images = []
-    for number, (name, own) in enumerate(known.items()):
-        rows, size = given[seen_by == number], (own.width, own.height) if isinstance(own, Camera) else own
-        images.append(Images(rows[..., :3], rows[..., 3:], *size))
+    for (name, own), rows in zip(known.items(), corners, strict=True):
+        images.append(
+            Images(rows[..., :3], rows[..., 3:], *((own.width, own.height) if isinstance(own, Camera) else own))
+        )
         _check_size(images[-1], f" of camera '{name}'" * (len(known) > 1))
     cameras = [own if isinstance(own, Camera) else None for own in known.values()]
     found = sighted_by_several(images, cameras, board)
     for name, camera, seen, shown in zip(known, cameras, found, images, strict=True):
         if camera is not None and len(seen.poses) >= FEWEST_IMAGES:
             _check_camera(seen, sighted(shown, None, board), name if len(known) > 1 else "")
-    order = torch.cat([(seen_by == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
-    poses, covariance, shared = (
-        torch.cat([getattr(own, name) for own in found])[order] for name in ("poses", "covariance", "shared")
-    )
-    errors = errors_of_poses(poses, covariance, shared, camera_on_tool=camera_on_tool)
-    after = dict(zip(known, (own.camera for own in found), strict=True))
-    return {"poses": poses, "corners": given, "cameras": after, "seen_by": seen_by} | errors
+    return found
 
 
 def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera_on_tool: bool) -> dict[str, Tensor]:
