@@ -26,7 +26,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.numbers import Numbers
@@ -393,7 +393,7 @@ class CampaignModel:
         """
         q, shifts = self.asked[1], 0 if self.data.shared is None else self.data.shared.shape[2]
         at = replace(self.data, nominal=self.data.nominal.typical, x=q, shared=None, observe=None, beside=None)
-        A, points = bodies_of(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
+        A, points = Bodies(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
         nothing, S = points.new_zeros(len(q), len(A)), torch.nn.functional.pad(A @ at.sensitivities, (0, shifts))
         own = {"target": nothing, "S": S, "J": A @ at.jacobian, "A": A.expand(len(q), *A.shape)}
         numbers = Numbers.of(q, at.points, torch.ones_like(nothing, dtype=torch.bool), **own)

@@ -24,7 +24,7 @@ from diffeo_calib.cli.options import CORNERS, Correction, Format, Rows, StoredUn
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
-from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
@@ -272,7 +272,7 @@ class ProgramTable:
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
         table = with_rows(self.table, turned) if rotation else self.table
         names, triples = joint_columns(self.joints, robot), _position_triples(position)
-        data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
+        data = read_observations(self.csv, TableColumns(names, triples, kinds=robot.kinds), table, duplicates="keep")
         return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:

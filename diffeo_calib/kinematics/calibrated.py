@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.re_registration.register_again import (
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
-from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     directions_of_frames,
@@ -86,7 +86,7 @@ class CalibratedKinematics:
         scales: Tensor | None = None,
         learnt: Registration | None = None,
     ) -> None:
-        self.bodies = bodies_of(lever)
+        self.bodies = Bodies(lever)
         self.bodies.check_points(map.m // 3)
         self.robot = robot
         self.map = map

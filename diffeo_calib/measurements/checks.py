@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from math import isnan
 from pathlib import Path
 
@@ -44,6 +45,15 @@ ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / ma
 def angle_mistake(words: str) -> str:
     """Sentence about a wrong unit of joint values."""
     return f"the joint values seem to be {words}; check the angle unit"
+
+
+@contextmanager
+def of_measurements() -> Iterator[None]:
+    """Errors of input within are those of measurements."""
+    try:
+        yield
+    except InputError as error:
+        raise error if isinstance(error, MeasurementError) else MeasurementError(str(error)) from None
 
 
 def in_other_unit(ratio: float, tolerance: float) -> bool:
@@ -111,14 +121,12 @@ def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[s
     """
     if is_data_frame(q):
         chosen = column_names(q) if names is None else [names] if isinstance(names, str) else list(names)
-        try:
+        with of_measurements():
             q = named_columns(q, chosen, "q")
-        except InputError as error:
-            raise MeasurementError(str(error)) from None
         names = [str(name) for name in chosen]
     angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
     check_size(angles, "q")
-    return angles, unique_names(names, "joint_names", angles.shape[1], "column of `q`")
+    return angles, checked_names(names, "joint_names", angles.shape[1], "column of `q`")
 
 
 def check_size(values: Tensor, name: str) -> None:
@@ -187,18 +195,26 @@ def check_rows(q: Tensor, other: Tensor, name: str) -> None:
 
 
 def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
-    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
+    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer; None if not known.
+
+    They are NaN where ``like`` is hidden, and given ones may be missing there.
+    """
     if value is None:
         return None
-    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
+    shapes, empty = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)], like.isnan()
     fix = "pass one standard deviation for all, one per row, or finer"
+    if bool(empty.any()):
+        value = real_tensor(value, name).detach().to(like.device)
+        if value.ndim >= 2 and value.shape == like.shape[: value.ndim]:
+            value = value.masked_fill(empty if value.ndim == like.ndim else empty.flatten(value.ndim).all(-1), 1.0)
     given = copied(value, name, *shapes, fix=fix).to(like.device)
     bad = (given <= 0).nonzero()
     if len(bad):
         where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
         what = f"`{name}`" + f", first at index {where}" * bool(where)
         raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
-    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+    found = given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape)
+    return found.masked_fill(empty, torch.nan)
 
 
 def covariates(given: Mapping[str, object], q: Tensor) -> dict[str, object]:
@@ -222,10 +238,8 @@ def payloads(value: object, q: Tensor) -> Tensor:
 
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
-    try:
+    with of_measurements():
         return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
 
 
 def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
@@ -234,13 +248,14 @@ def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tupl
     Args:
         names: of the bodies' tips. bodies: number of markers or measured frames. points: of each body.
     """
-    if names is None:
-        return None
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != bodies or not all(isinstance(name, str) for name in names):
-        fix = f"pass the name of a tip for every {'marker' if points == 1 else 'measured frame'}"
-        raise MeasurementError.of("`on`", expected=f"{bodies} names", got=f"{len(names)} ({names})", fix=fix)
-    return tuple(name for name in names for _ in range(points))
+    each = "marker" if points == 1 else "measured frame"
+    found = checked_names(names, "on", bodies, each, distinct=False)
+    return found and tuple(name for name in found for _ in range(points))
+
+
+def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[str]:
+    """(N,) names of numbered things, "" for the number -1, and for all of ``rows`` without numbers."""
+    return [""] * rows if numbers is None else [names[number] if number >= 0 else "" for number in numbers.tolist()]
 
 
 def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
@@ -252,21 +267,23 @@ def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | No
     return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
 
 
-def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
-    """Return distinct names, one for each of ``count`` things."""
+def checked_names(
+    names: Sequence[str] | None, what: str, count: int, each: str, *, distinct: bool = True
+) -> tuple[str, ...] | None:
+    """Return names, one for each of ``count`` things, of which none has two unless ``distinct`` is False."""
     if names is None:
         return None
     try:
         names = (names,) if isinstance(names, str) else tuple(names)
     except (TypeError, RuntimeError):
         names = ()
+    fix = f"pass one per {each}"
     if not all(isinstance(name, str) for name in names):
         got = few([type(name).__name__ for name in names])
-        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=f"pass one name per {each}")
+        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=fix)
     if len(names) != count:
-        got = f"{len(names)} ({names})"
-        raise MeasurementError.of(f"`{what}`", expected=count, got=got, fix=f"pass one per {each}")
-    if len(set(names)) < len(names):
+        raise MeasurementError.of(f"`{what}`", expected=f"{count} names", got=f"{len(names)} ({names})", fix=fix)
+    if distinct and len(set(names)) < len(names):
         fix = "rename the repeated ones"
         raise MeasurementError.of(f"`{what}`", expected="distinct names", got=list(names), fix=fix)
     return names
@@ -284,10 +301,8 @@ def marker_places(points: object) -> Tensor:
         MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
     """
     shapes, fix = (("N", "P", 3), ("N", 3)), "pass x, y and z of every marker, in metres"
-    try:
+    with of_measurements():
         raw = real_tensor(points, "points").detach()
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
     empty = raw.isnan() & (raw.ndim == 3 and raw.shape[1] > 1)  # a single marker is in every row
     places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
     if not bool(empty.any()):
@@ -298,24 +313,6 @@ def marker_places(points: object) -> Tensor:
         what = f"`points`, row {few(rows)}: no marker was seen"
         raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
     return places.masked_fill(empty, torch.nan)
-
-
-def marker_deviations(std: object, places: Tensor, name: str = "std") -> Tensor | None:
-    """Standard deviations (N, P, 3) of markers, NaN where they are hidden; given ones may be missing there.
-
-    Args:
-        std: one for all, (N,), (N, P) or (N, P, 3), m; None if they are not known.
-        places: (N, P, 3) m, NaN where hidden.
-        name: of the argument, for messages.
-    """
-    empty = places.isnan()
-    if std is None or not bool(empty.any()):
-        return deviations(std, name, places)
-    given = real_tensor(std, name).detach().to(places.device)
-    if given.ndim >= 2 and given.shape == places.shape[: given.ndim]:
-        given = given.masked_fill(empty if given.ndim == 3 else empty.all(2), 1.0)
-    found = deviations(given, name, places)
-    return None if found is None else found.masked_fill(empty, torch.nan)
 
 
 def _check_whole(empty: Tensor) -> None:

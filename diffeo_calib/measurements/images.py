@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -12,9 +13,10 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers
+from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers, texts_of
 from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
-from diffeo_calib.measurements.rows import RowTable, with_attributes
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,11 +33,9 @@ Known = tuple[int, int] | Camera
 ONLY_CAMERA = "camera"
 """Name of a camera that is alone."""
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
-IMAGE_COLUMNS = ("corners", "seen_by", *OF_POSES)
-NO_IMAGES = dict.fromkeys(IMAGE_COLUMNS) | {"cameras": {}}
 
 
-class ImageTable(RowTable):
+class ImageTable(SocketTable):
     """Columns of tables of images beside poses.
 
     Attributes:
@@ -46,18 +46,13 @@ class ImageTable(RowTable):
             larger than was said, as a share. All in the axes of :func:`pose_jacobian`.
     """
 
-    frames: Any
-    points: Tensor
-    board: Tensor | None
-    lever: Any
-    session: Tensor | None
-    session_names: tuple[str, ...]
-    corners: Tensor | None
-    cameras: Mapping[str, Camera]
-    seen_by: Tensor | None
-    pose_covariance: Tensor | None
-    pose_shared: Tensor | None
-    pose_larger: Tensor | None
+    BY_IMAGE = ("corners", "seen_by", *OF_POSES)
+    corners: Tensor | None = None
+    cameras: Mapping[str, Camera] = MappingProxyType({})
+    seen_by: Tensor | None = None
+    pose_covariance: Tensor | None = None
+    pose_shared: Tensor | None = None
+    pose_larger: Tensor | None = None
 
     @classmethod
     def from_images(
@@ -98,31 +93,26 @@ class ImageTable(RowTable):
         angles, joints = joint_table(q, joint_names)
         numbers, names = session_numbers(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
-        seen = image_columns(angles, corners, numbers, known, board, camera_on_tool=camera_on_tool)
+        given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
+        if given.ndim != 3 or given.shape[2] != 5:
+            fix = (
+                "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
+            )
+            raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
+        check_rows(angles, given, "corners")
+        given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
+        own = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
+        found = _sights([given[own == number] for number in range(len(known))], known, board)
+        order = torch.cat([(own == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
+        poses, *errors = (
+            torch.cat([getattr(one, name) for one in found])[order] for name in ("poses", "covariance", "shared")
+        )
         named = {"camera_on_tool": camera_on_tool, "doubt": doubt}
-        found = with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
-        return found.with_sessions(seen_by, remounted=camera_on_tool)
-
-    @classmethod
-    def from_poses(cls, q: Any, poses: Any, joint_names: Sequence[str] | None = None, **known: Any) -> Self:
-        """See :meth:`Measurements.from_poses`."""
-        raise NotImplementedError
-
-    def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Self:
-        """See :meth:`Measurements.with_sessions`."""
-        raise NotImplementedError
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables, their set-ups numbered alike."""
-        names = tuple(dict.fromkeys(name for table in tables for name in table.session_names))
-        found = []
-        for table in super().of_one_layout(tables):
-            numbers = [*(names.index(name) for name in table.session_names), -1]
-            own = torch.tensor(numbers, dtype=torch.int64, device=HOST)
-            session = None if table.session is None else own[table.session]
-            found.append(table if session is None else with_attributes(table, session=session, session_names=names))
-        return found
+        cameras = dict(zip(known, (one.camera for one in found), strict=True))
+        columns = {"corners": given, "cameras": cameras, "seen_by": own}
+        columns |= errors_of_poses(poses, *errors, camera_on_tool=camera_on_tool)
+        data = with_attributes(cls.from_poses(angles, poses, joints, **named), **columns)
+        return data.with_sessions(seen_by, remounted=camera_on_tool)
 
     @property
     def camera(self) -> Camera | None:
@@ -132,8 +122,7 @@ class ImageTable(RowTable):
     @property
     def camera_names(self) -> list[str]:
         """(N,) name of the camera of each image."""
-        names = list(self.cameras)
-        return [] if self.seen_by is None else [names[number] for number in self.seen_by.tolist()]
+        return [] if self.seen_by is None else texts_of(self.seen_by, list(self.cameras), len(self))
 
     def set_ups(self, names: Sequence[str] | None, *, remounted: bool) -> Sequence[str] | None:
         """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them.
@@ -150,11 +139,6 @@ class ImageTable(RowTable):
             return names
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
-
-    @property
-    def same_tool(self) -> bool:
-        """Whether the set-ups are cameras, between which nothing on the tool was mounted again."""
-        return set(self.session_names) <= set(self.cameras)
 
     @property
     def sees_board_from_tool(self) -> bool | None:
@@ -175,13 +159,18 @@ class ImageTable(RowTable):
         return self._pose_slopes() @ self.pose_larger
 
     def errors_along(self, R: Tensor) -> dict[str, object]:
-        """Errors of poses along axes turned by R (N, 3, 3)."""
+        """Known errors along axes turned by R (N, 3, 3), as if those of the coordinates were independent."""
+        found: dict[str, object] = {}
+        for name in ("std", "rotation_std"):
+            own = getattr(self, name)
+            if own is not None:
+                found[name] = (own.view(len(self), -1, 3).square() @ R.square().mT).sqrt().view_as(own)
         if self.pose_covariance is None or self.pose_shared is None or self.pose_larger is None:
-            return {}
+            return found
         axes = torch.zeros_like(self.pose_covariance)
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
-        found = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
-        return dict(zip(OF_POSES, found, strict=True))
+        of_poses = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
+        return found | dict(zip(OF_POSES, of_poses, strict=True))
 
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
@@ -204,14 +193,8 @@ class ImageTable(RowTable):
             raise MeasurementError.of("frames on the tool", expected="poses of a camera on it", got="others")
         M = transforms.to(self.points)
         R, frames = M[:, :3, :3], self.frames @ torch.linalg.inv(M)[:, None]
-        changes: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
-        changes |= {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
+        changes = ONE_SESSION | {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
         changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
-        for name in ("std", "rotation_std"):
-            known = getattr(self, name)
-            if known is not None:
-                turned = (R.square() @ known.view(len(self), 3, 1).square()).sqrt()
-                changes[name] = turned.view_as(known)
         return with_attributes(self, **changes, **self.errors_along(R))
 
     def _pose_slopes(self) -> Tensor:
@@ -248,40 +231,20 @@ def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
     return found
 
 
-def image_columns(
-    q: Tensor,
-    corners: object,
-    seen_by: Tensor | None,
-    known: Mapping[str, Known],
-    board: BoardPrior | None,
-    *,
-    camera_on_tool: bool,
-) -> dict[str, Any]:
-    """The columns of :meth:`Measurements.from_images`, poses among them; arguments and errors as there."""
-    given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
-    if given.ndim != 3 or given.shape[2] != 5:
-        fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
-        raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
-    check_rows(q, given, "corners")
-    given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
-    seen_by = torch.zeros(len(q), dtype=torch.int64, device=HOST) if seen_by is None else seen_by
+def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardPrior | None) -> Sequence[Sights]:
+    """What each camera saw, of its corners (N_i, K, 5); a warning or an error about one that saw it otherwise."""
     images = []
-    for number, (name, own) in enumerate(known.items()):
-        rows, size = given[seen_by == number], (own.width, own.height) if isinstance(own, Camera) else own
-        images.append(Images(rows[..., :3], rows[..., 3:], *size))
+    for (name, own), rows in zip(known.items(), corners, strict=True):
+        images.append(
+            Images(rows[..., :3], rows[..., 3:], *((own.width, own.height) if isinstance(own, Camera) else own))
+        )
         _check_size(images[-1], f" of camera '{name}'" * (len(known) > 1))
     cameras = [own if isinstance(own, Camera) else None for own in known.values()]
     found = sighted_by_several(images, cameras, board)
     for name, camera, seen, shown in zip(known, cameras, found, images, strict=True):
         if camera is not None and len(seen.poses) >= FEWEST_IMAGES:
             _check_camera(seen, sighted(shown, None, board), name if len(known) > 1 else "")
-    order = torch.cat([(seen_by == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
-    poses, covariance, shared = (
-        torch.cat([getattr(own, name) for own in found])[order] for name in ("poses", "covariance", "shared")
-    )
-    errors = errors_of_poses(poses, covariance, shared, camera_on_tool=camera_on_tool)
-    after = dict(zip(known, (own.camera for own in found), strict=True))
-    return {"poses": poses, "corners": given, "cameras": after, "seen_by": seen_by} | errors
+    return found
 
 
 def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera_on_tool: bool) -> dict[str, Tensor]:

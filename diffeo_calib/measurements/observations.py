@@ -5,27 +5,23 @@ The ball is one target: that of the rows in sockets, of the readings, and the la
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, covariates, payloads
+from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,
-    RANGES,
     RowGroups,
     RowTable,
     check_alike,
     common,
-    joint_ranges,
     set_attributes,
-    with_attributes,
 )
 
 WITH_POSITION = ("position", "pose", "mixture")
@@ -44,27 +40,22 @@ class Observations(RowGroups):
             :class:`Readings`, in the order of their first rows. Positions and rows in sockets are parts of their own.
         index: (N_i,) int64 for each part, its row numbers here.
 
-    Attributes:
-        q: (N, n) joint configurations, rad or m.
-        line_numbers: (N,) int64, where every row comes from, see :class:`Measurements`. A line that holds observations
-            of several kinds is several rows.
-        payload: (N,) known masses that the robot carried; None where they are not known.
+    Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload and covariates
+    hold the values of all rows. A line of a file that holds observations of several kinds is several rows.
     """
-
-    parts: tuple[Any, ...]
-    index: tuple[Tensor, ...]
-    q: Tensor
-    line_numbers: Tensor
-    payload: Tensor | None
 
     def __init__(self, parts: Sequence[Any], index: Sequence[Tensor]) -> None:
         order = sorted(range(len(index)), key=lambda k: int(index[k].min()))
-        tables, numbers = [parts[k] for k in order], [index[k] for k in order]
+        tables = [parts[k] for k in order]
         _check_joinable(tables)
-        set_attributes(self, parts=tuple(tables), index=tuple(numbers))
-        payload = None if tables[0].payload is None else self._whole([part.payload for part in tables])
-        lines = self._whole([part.line_numbers for part in tables])
-        set_attributes(self, q=self._whole([part.q for part in tables]), line_numbers=lines, payload=payload)
+        set_attributes(self, parts=tuple(tables), index=tuple(index[k] for k in order))
+        for name in ("joint_names", "payload_at", "covariate_names"):
+            set_attributes(self, **{name: getattr(tables[0], name)})
+        for name in ("file_sha256", "origin"):
+            set_attributes(self, **{name: common([getattr(part, name) for part in tables])})
+        for name in ("q", "line_numbers", "payload", "covariates"):
+            own = [getattr(part, name) for part in tables]
+            set_attributes(self, **{name: None if own[0] is None else self._whole(own)})
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:
@@ -75,37 +66,6 @@ class Observations(RowGroups):
                 on other tips, other sockets, or a ball on another tip.
         """
         return _observations(_pieces(parts))
-
-    @property
-    def joint_names(self) -> tuple[str, ...] | None:
-        """Names of the joints, in the order of the columns of ``q``."""
-        return self.parts[0].joint_names
-
-    @property
-    def payload_at(self) -> str | None:
-        """Name of the link that carried the payloads; None for the robot's tip."""
-        return self.parts[0].payload_at
-
-    @property
-    def covariate_names(self) -> tuple[str, ...]:
-        """Names of the columns of ``covariates``."""
-        return self.parts[0].covariate_names
-
-    @property
-    def covariates(self) -> Tensor | None:
-        """(N, K) values with which something may drift; None without any."""
-        own = [part.covariates for part in self.parts]
-        return None if own[0] is None else self._whole(own)
-
-    @property
-    def file_sha256(self) -> str | None:
-        """SHA-256 of the file that all rows were read from; None for arrays, or several files."""
-        return common([part.file_sha256 for part in self.parts])
-
-    @property
-    def origin(self) -> object | None:
-        """That file and how it was read; None for arrays, or several files."""
-        return common([part.origin for part in self.parts])
 
     @property
     def sha256(self) -> str:
@@ -154,15 +114,6 @@ class Observations(RowGroups):
         """(N,) int64, number of each row's socket, -1 for other rows."""
         return self._whole([part.socket_numbers for part in self.parts])
 
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""
-        found = [
-            (int(rows[first]), int(rows[second]))
-            for part, rows in zip(self.parts, self.index, strict=True)
-            for first, second in part.copies()
-        ]
-        return sorted(((min(pair), max(pair)) for pair in found), key=lambda pair: pair[1])
-
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint")
         words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
@@ -183,17 +134,8 @@ class Observations(RowGroups):
         whole.insert(0, "kind", self.kinds)
         return whole
 
-    def _repr_html_(self) -> str:
-        ranges = [one for part in self.parts for one in part.ranges]
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
-
     def rows(self, index: object) -> Observations:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
+        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         parts, numbers = [], []
         for part, own in zip(self.parts, self.index, strict=True):
@@ -205,43 +147,10 @@ class Observations(RowGroups):
                 numbers.append(here)
         return Observations(parts, numbers)
 
-    def to(self, device: torch.device | str) -> Observations:
-        """Return the same rows with their values on a device."""
-        return Observations([part.to(device) for part in self.parts], self.index)
-
-    def with_joint_names(self, names: Sequence[str]) -> Observations:
-        """Return the same rows under other names of the joints, see :meth:`Measurements.with_joint_names`."""
-        return Observations([part.with_joint_names(names) for part in self.parts], self.index)
-
-    def with_payload(self, payload: object, at: str | None = None) -> Observations:
-        """Return the same rows with a payload of known mass, see :meth:`Measurements.with_payload`."""
-        masses = None if payload is None else payloads(payload, self.q)
-        own = [None if masses is None else masses[rows.to(masses.device)] for rows in self.index]
-        return Observations([part.with_payload(m, at) for part, m in zip(self.parts, own, strict=True)], self.index)
-
-    def with_covariates(self, *, time: object = None, temperature: object = None) -> Observations:
-        """Return the same rows with columns with which something may drift: :meth:`Measurements.with_covariates`."""
-        found = covariates({"time": time, "temperature": temperature}, self.q)
-        parts = []
-        for part, rows in zip(self.parts, self.index, strict=True):
-            own = found["covariates"]
-            own = own[rows.to(own.device)] if isinstance(own, Tensor) else None
-            parts.append(with_attributes(part, covariates=own, covariate_names=found["covariate_names"]))
-        return Observations(parts, self.index)
-
-    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Observations:
-        """Return the same rows with other line numbers (N,), see :meth:`Measurements.with_line_numbers`."""
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row").to(HOST)
-        parts = [part.with_line_numbers(lines[rows]) for part, rows in zip(self.parts, self.index, strict=True)]
-        return Observations(parts, self.index)
-
-    def with_file_sha256(self, sha256: str | None) -> Observations:
-        """Return the same rows as those of the file with this SHA-256."""
-        return Observations([part.with_file_sha256(sha256) for part in self.parts], self.index)
-
-    def with_origin(self, origin: object) -> Observations:
-        """Return the same rows as those of a table that can be read again."""
-        return Observations([part.with_origin(origin) for part in self.parts], self.index)
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Observations:
+        """See :class:`RowGroups`."""
+        pairs = zip(self.parts, self.index, strict=True)
+        return Observations([change(part, rows) for part, rows in pairs], self.index)
 
     def _whole(self, values: Sequence[Tensor]) -> Tensor:
         """Values (N_i, ...) of the parts in the order of the rows: (N, ...)."""
@@ -257,25 +166,22 @@ def joined_tables(tables: Sequence[Any]) -> Any:
     """The rows of several tables in order: one table of measurements or readings if it can hold them."""
     pieces = _pieces(tables)
     kinds = {piece.table.kind for piece in pieces}
-    if not any(kinds <= one for one in ONE_TABLE):
-        found = _observations(pieces)
-        part, rows = next(zip(found.parts, found.index, strict=True))
-        return found if len(found.parts) > 1 else part.rows(rows.argsort())
-    own = [piece.table for piece in pieces]
-    if all(isinstance(table, RowTable) for table in tables):
-        return type(tables[0]).in_one(tables)
-    whole = type(own[0]).in_one(own)
-    return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+    if any(kinds <= one for one in ONE_TABLE):
+        whole = type(pieces[0].table).in_one([piece.table for piece in pieces])
+        return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+    found = _observations(pieces)
+    part, rows = next(zip(found.parts, found.index, strict=True))
+    return found if len(found.parts) > 1 else part.rows(rows.argsort())
 
 
-class _Piece(NamedTuple):
+class Rows(NamedTuple):
     """A table of one kind, or a mixture of positions and sockets, and its row numbers (M,) in the whole."""
 
     table: Any
     rows: Tensor
 
 
-def _pieces(tables: Sequence[Any]) -> list[_Piece]:
+def _pieces(tables: Sequence[Any]) -> list[Rows]:
     """The parts of all tables, numbered one table after another."""
     given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
     if not given:
@@ -286,18 +192,18 @@ def _pieces(tables: Sequence[Any]) -> list[_Piece]:
             raise MeasurementError.of("tables to join", expected=expected, got=got)
     found, start = [], 0
     for table in given:
-        found += [_Piece(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
+        found += [Rows(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
         start += len(table)
     return found
 
 
-def _observations(pieces: Sequence[_Piece]) -> Observations:
+def _observations(pieces: Sequence[Rows]) -> Observations:
     """The pieces as observations, those of the same kind as one part."""
     _check_joinable([piece.table for piece in pieces])
-    groups: dict[object, list[_Piece]] = {}
-    whole = [_Piece(*pure) for piece in pieces for pure in unmixed(*piece)]
+    groups: dict[object, list[Rows]] = {}
+    whole = [Rows(*pure) for piece in pieces for pure in unmixed(*piece)]
     if any("corners" in piece.table.columns for piece in whole):
-        whole = [_Piece(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
+        whole = [Rows(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
     for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
     parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]

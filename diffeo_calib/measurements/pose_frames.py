@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import real_tensor, wrapped
-from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.checks import check_rows, deviations, marker_deviations
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.poses import (
     ONE_POSE,
     check_lever,
@@ -166,44 +165,6 @@ def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
         board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
     """
     return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]
-
-
-def pose_columns(
-    q: Tensor, poses: object, lever: float, position_std: object, rotation_std: object, *, camera_on_tool: bool
-) -> dict[str, Tensor | None]:
-    """The columns "poses", "points", "board" and known deviations of measurements.
-
-    Arguments are those of :meth:`Measurements.from_poses`.
-
-    Raises:
-        MeasurementError: as there.
-    """
-    try:
-        frames, board = checked_frames(poses).to(q.device), None
-        if camera_on_tool:
-            if frames.shape[1] > 1:
-                what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the poses"
-                fix += " of the cameras in the board's frame"
-                raise InputError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
-            frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
-        points = points_of_frames(frames, lever)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
-    check_rows(q, frames, "poses")
-    known = {"position_std": position_std, "rotation_std": rotation_std}
-    std, turns = (_deviations(value, name, frames[..., :3, 3]) for name, value in known.items())
-    single = turns is not None and frames.shape[1] == 1
-    rotations = turns[:, 0] if single and turns is not None else turns
-    known = {"std": std, "rotation_std": rotations, "board": board}
-    return {"poses": of_frames(frames), "points": points} | known
-
-
-def _deviations(value: object, name: str, places: Tensor) -> Tensor | None:
-    """Standard deviations (N, T, 3) of values as they are given for frames at (N, T, 3)."""
-    if places.shape[1] > 1:
-        return marker_deviations(value, places, name)
-    found = deviations(value, name, places[:, 0])
-    return None if found is None else found[:, None]
 
 
 def visible_rotation_numbers(frames: Tensor, convention: str, angle: str) -> Tensor:

@@ -19,15 +19,15 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
-    chosen_rows,
     copied,
     deviations,
     joint_table,
     session_numbers,
+    texts_of,
     tip_names,
 )
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowTable, exact_copies, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
@@ -65,6 +65,7 @@ class Readings(RowTable):
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
 
+    NUMBERED = "device", "names"
     flattery = FLATTERY
 
     kind: str
@@ -277,7 +278,7 @@ class Readings(RowTable):
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the device of each row."""
-        return [self.names[number] for number in self.device.tolist()]
+        return texts_of(self.device, self.names, len(self))
 
     @property
     def ball_tip(self) -> str | None:
@@ -310,13 +311,8 @@ class Readings(RowTable):
         return [value_range(*one, unit) for one in zip(self.value_names, self.reported.T, strict=True)]
 
     def rows(self, index: object) -> Readings:
-        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order, and their devices.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
-        found = super().rows(chosen_rows(index, len(self)))
+        """See :class:`RowGroups`; the devices are those of these rows."""
+        found = super().rows(index)
         used, numbers = found.device.unique(return_inverse=True)
         return with_attributes(found, device=numbers, names=tuple(self.names[number] for number in used.tolist()))
 
@@ -325,19 +321,10 @@ class Readings(RowTable):
         names = tip_names(on, 1)
         return with_attributes(self, on=None if names is None else names[0])
 
-    def copies(self) -> list[tuple[int, int]]:
-        """(earlier row, row) for every row that repeats an earlier one exactly, its device included."""
-        return exact_copies(torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1))
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Readings]) -> Sequence[Readings]:
-        """The same tables, their devices numbered alike."""
-        names = tuple(dict.fromkeys(name for table in tables for name in table.names))
-        found = []
-        for table in tables:
-            own = torch.tensor([names.index(name) for name in table.names], dtype=torch.int64, device=HOST)
-            found.append(with_attributes(table, device=own[table.device], names=names))
-        return found
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowTable`."""
+        return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
 
 
 def _doubted(data: Readings, doubt: bool) -> Readings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -11,11 +11,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written, printable, warn_user
-from diffeo_calib.measurements.checks import chosen_rows, copied, covariates, payloads, unique_names, unlikely_si_joints
+from diffeo_calib.common.errors import MeasurementError, printable, warn_user
+from diffeo_calib.measurements.checks import (
+    checked_names,
+    chosen_rows,
+    copied,
+    covariates,
+    payloads,
+    unlikely_si_joints,
+)
+from diffeo_calib.measurements.splits import (
+    CONFIGURATIONS,
+    PLACES,
+    REPEAT_TOLERANCE,
+    connected,
+    exact_copies,
+    fold_numbers,
+    in_train,
+    repeat_groups,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -38,116 +54,34 @@ def set_attributes(data: object, **attributes: object) -> None:
         object.__setattr__(data, name, value)
 
 
+ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
+"""Columns of numbers that stay on the host."""
 NO_SOCKET = -1
 """Number of the socket of rows whose positions a device measured."""
-REPEAT_TOLERANCE = 1e-3
-"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
 RANGES = ("column", "from [rad or m]", "to", "degrees")
 """Header of the ranges that notebooks show."""
-CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
-"""Words for what a split keeps together."""
-
-
-def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
-    """Label repeated configurations: (N, n) -> (N,) int64 labels 0, 1, ... in the order of first appearance.
-
-    The first row without a group leads a new one, which takes all later rows without a group that are within
-    ``tolerance`` of the leader in every joint. Rows along a slow trajectory thus do not chain into a single group.
-    """
-    from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    check_number(tolerance, "`tolerance`", above=-1e-300)
-    tree = KDTree(q.cpu().numpy())
-    labels = np.full(len(q), -1)
-    count = 0
-    for row in range(len(q)):
-        if labels[row] < 0:
-            near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
-            labels[near[labels[near] < 0]] = count
-            count += 1
-    return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
-
-
-def exact_copies(table: Tensor) -> list[tuple[int, int]]:
-    """(earlier row, row) for every row of a table (N, c) that repeats an earlier one exactly, NaN for NaN."""
-    values = np.where(np.isnan(rows := table.cpu().numpy()), np.nan, rows) + 0.0  # one kind of NaN; -0.0 becomes 0.0
-    first: dict[bytes, int] = {}
-    pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
-    return [(earlier, number) for earlier, number in pairs if earlier != number]
-
-
-def connected(first: Tensor, second: Tensor) -> Tensor:
-    """(N,) labels of rows that share a label in one of two groupings (N,), or are linked by such rows."""
-    from scipy.sparse import coo_matrix  # noqa: PLC0415  # slow to import, not needed to use a model
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    one, other = (labels.unique(return_inverse=True)[1].numpy() for labels in (first, second))
-    count = int(one.max()) + 1
-    size = count + int(other.max()) + 1
-    links = coo_matrix((np.ones(len(one)), (one, count + other)), shape=(size, size))
-    labels = connected_components(links)[1][one]
-    return torch.as_tensor(labels, dtype=torch.int64, device=HOST).unique(return_inverse=True)[1]
-
-
-def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
-    """Choose whole groups at random for training: labels (N,) -> boolean (N,).
-
-    Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
-
-    Raises:
-        MeasurementError: fraction outside (0, 1), or a single group, so that one part would be empty.
-    """
-    if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
-        fix = "pass the share of rows to train on, such as 0.7"
-        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
-    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
-    target, rows, chosen = round(fraction * len(labels)), 0, []
-    for group in order:
-        after = rows + sizes[group]
-        nearer = abs(after - target) < abs(rows - target)
-        if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
-            rows, chosen = after, [*chosen, group]
-    return np.isin(labels.numpy(), chosen)
-
-
-def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
-    """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
-
-    Raises:
-        MeasurementError: k below 2, or fewer groups than folds.
-    """
-    if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
-        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
-    sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
-    largest_first = order[np.argsort(-sizes[order], kind="stable")]
-    load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
-    for group in largest_first:
-        fold_of[group] = load.argmin()
-        load[fold_of[group]] += sizes[group]
-    return fold_of[labels.numpy()]
-
-
-def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
-    try:
-        checked_seed = check_seed(seed)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
-    sizes = np.bincount(labels.numpy())
-    if len(sizes) < fewest:
-        together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
-        got = f"{len(sizes)} (in {len(labels)} rows; {together} stay together)"
-        fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
-        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
-    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))
 
 
 @methods_outside_inference_mode
 class RowGroups:
-    """Rows that are divided, with repeated configurations kept together, and the sockets of a place."""
+    """Rows that are divided, with repeated configurations kept together, and the sockets of a place.
+
+    Attributes:
+        parts: tables of one kind each. index: (N_i,) int64 for each part, its row numbers here.
+        covariates: (N, K) values with which something may drift, such as times and temperatures, in any unit.
+    """
 
     q: Tensor
     line_numbers: Tensor
+    joint_names: tuple[str, ...] | None = None
+    payload: Tensor | None = None
+    payload_at: str | None = None
+    file_sha256: str | None = None
+    origin: object | None = None
+    covariates: Tensor | None = None
+    covariate_names: tuple[str, ...] = ()
+    parts: tuple[Any, ...]
+    index: tuple[Tensor, ...]
 
     @property
     def n(self) -> int:
@@ -169,24 +103,113 @@ class RowGroups:
         return (self.rows(i) for i in range(len(self)))
 
     def rows(self, index: object) -> Self:
-        """Some of the rows."""
+        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
         raise NotImplementedError
 
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
+        """The same rows after a change of each part, given with its row numbers (N_i,)."""
         raise NotImplementedError
+
+    def with_columns(self, **columns: object) -> Self:
+        """The same rows with other attributes; tensors (N, ...) have a value for each row."""
+
+        def changed(part: Any, rows: Tensor) -> Any:
+            own = {name: v[rows.to(v.device)] if isinstance(v, Tensor) else v for name, v in columns.items()}
+            return with_attributes(part, **own)
+
+        return self.of_each(changed)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same rows with their values on a device."""
+        place = usable(device)
+
+        def moved(part: Any, _: Tensor) -> Any:
+            return with_attributes(part, **{k: v.to(place) for k, v in part.columns.items() if k not in ON_HOST})
+
+        return self.of_each(moved)
+
+    def with_joint_names(self, names: Sequence[str]) -> Self:
+        """Return the same rows under other names of the joints.
+
+        Raises:
+            MeasurementError: a number of names that does not match, or repeated names.
+        """
+        return self.with_columns(joint_names=checked_names(names, "names", self.n, "column of `q`"))
+
+    def with_payload(self, payload: object, at: str | None = None) -> Self:
+        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return self.with_columns(payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
+        """Return the same rows with columns with which device or arm may drift.
+
+        A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
+        the model, which then holds for the middle of each column's range.
+
+        Args:
+            time, temperature: values (N,), in any unit; None if they are not known.
+
+        Raises:
+            MeasurementError: not one per row, or not finite.
+        """
+        return self.with_columns(**covariates({"time": time, "temperature": temperature}, self.q))
+
+    def with_load(self, load: Payload) -> Self:
+        """Return the same rows with the masses of a payload, if there is one."""
+        return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
+
+    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
+        """Return the same rows with other line numbers (N,), which tell where every row comes from.
+
+        Raises:
+            MeasurementError: not one per row.
+        """
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
+
+    def with_file_sha256(self, sha256: str | None) -> Self:
+        """Return the same rows as those of the file with this SHA-256."""
+        return self.with_columns(file_sha256=sha256)
+
+    def with_origin(self, origin: object) -> Self:
+        """Return the same rows as those of a table that can be read again."""
+        return self.with_columns(origin=origin)
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly.
+
+        Real repeats differ by noise.
+        """
+        pairs = zip(self.parts, self.index, strict=True)
+        found = [sorted(rows[list(pair)].tolist()) for part, rows in pairs for pair in exact_copies(part.compared)]
+        return sorted(((first, second) for first, second in found), key=lambda pair: pair[1])
+
+    def _repr_html_(self) -> str:
+        ranges = [one for part in self.parts for one in part.ranges]
+        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
 
     @property
     def masses(self) -> Tensor:
         """(N,) payloads of the rows; (0,) where they are not known."""
-        payload = getattr(self, "payload", None)
-        return self.q.new_zeros(0) if payload is None else payload
+        return self.q.new_zeros(0) if self.payload is None else self.payload
 
     @property
     def drifting(self) -> dict[str, Tensor]:
         """The covariates (N,) by name."""
-        values: Any = getattr(self, "covariates", None)
-        return {} if values is None else dict(zip(getattr(self, "covariate_names", ()), values.T, strict=True))
+        return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
 
     @property
     def places(self) -> Tensor:
@@ -207,11 +230,6 @@ class RowGroups:
     def smallest_inflation(self) -> float:
         """Smallest factor on variances that errors of left-out rows justify: no reading shows every direction."""
         return 1.0 if self.without_device else 0.0
-
-    @property
-    def resting(self) -> tuple[Self, ...]:
-        """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
-        return ()
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -285,10 +303,6 @@ class RowGroups:
         return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 
-ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
-"""Columns of numbers that stay on the host."""
-
-
 @methods_outside_inference_mode
 class RowTable(RowGroups):
     """N rows with one value per column and row; its columns are the attributes ``BY_ROW`` that are not None."""
@@ -299,17 +313,11 @@ class RowTable(RowGroups):
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
 
+    NUMBERED: ClassVar[tuple[str, str]]
+    """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
+
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
-
-    joint_names: tuple[str, ...] | None
-    payload: Tensor | None
-    payload_at: str | None
-    file_sha256: str | None
-    origin: object | None
-    covariates: Tensor | None = None
-    """(N, K) values with which something may drift, such as times and temperatures, in any unit."""
-    covariate_names: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -332,74 +340,13 @@ class RowTable(RowGroups):
         return [(self, *self.index)]
 
     def rows(self, index: object) -> Self:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
+        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 
-    def to(self, device: torch.device | str) -> Self:
-        """Return the same rows with their values on a device."""
-        place = usable(device)
-        return with_attributes(self, **{name: t.to(place) for name, t in self.columns.items() if name not in ON_HOST})
-
-    def with_joint_names(self, names: Sequence[str]) -> Self:
-        """Return the same rows under other names of the joints.
-
-        Raises:
-            MeasurementError: a number of names that does not match, or repeated names.
-        """
-        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
-
-    def with_payload(self, payload: object, at: str | None = None) -> Self:
-        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
-
-        Args:
-            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
-            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
-
-        Raises:
-            MeasurementError: not one per row, negative, or not finite.
-        """
-        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
-
-    def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
-        """Return the same rows with columns with which device or arm may drift.
-
-        A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
-        the model, which then holds for the middle of each column's range.
-
-        Args:
-            time, temperature: values (N,), in any unit; None if they are not known.
-
-        Raises:
-            MeasurementError: not one per row, or not finite.
-        """
-        return with_attributes(self, **covariates({"time": time, "temperature": temperature}, self.q))
-
-    def with_load(self, load: Payload) -> Self:
-        """Return the same rows with the masses of a payload, if there is one."""
-        return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
-
-    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
-        """Return the same rows with other line numbers (N,), which tell where every row comes from.
-
-        Raises:
-            MeasurementError: not one per row.
-        """
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
-
-    def with_file_sha256(self, sha256: str | None) -> Self:
-        """Return the same rows as those of the file with this SHA-256."""
-        return with_attributes(self, file_sha256=sha256)
-
-    def with_origin(self, origin: object) -> Self:
-        """Return the same rows as those of a table that can be read again."""
-        return with_attributes(self, origin=origin)
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
+        """See :class:`RowGroups`."""
+        return change(self, *self.index)
 
     def to_frame(self) -> Any:
         """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
@@ -420,12 +367,14 @@ class RowTable(RowGroups):
         raise NotImplementedError
 
     @property
+    def compared(self) -> Tensor:
+        """(N, c) numbers in which a row that repeats another one equals it."""
+        raise NotImplementedError
+
+    @property
     def ranges(self) -> list[list[str]]:
         """Column, smallest and largest value and their unit, of what was measured."""
         raise NotImplementedError
-
-    def _repr_html_(self) -> str:
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + self.ranges)
 
     def warn_if_suspicious(self) -> None:
         """Warn about exact copies of rows, and about joint values that look like degrees."""
@@ -450,8 +399,15 @@ class RowTable(RowGroups):
 
     @classmethod
     def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables with the same columns, those of a few being empty."""
-        return tables
+        """The same tables with the same columns, those of a few being empty, and set-ups or devices numbered alike."""
+        column, texts = cls.NUMBERED
+        names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
+        found = []
+        for table in tables:
+            own, numbers = [*(names.index(name) for name in getattr(table, texts)), -1], getattr(table, column)
+            new = torch.tensor(own, dtype=torch.int64, device=HOST)
+            found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
+        return found
 
 
 def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:

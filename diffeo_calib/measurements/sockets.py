@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
-from diffeo_calib.measurements.checks import row_names
+from diffeo_calib.measurements.checks import row_names, texts_of
 from diffeo_calib.measurements.rows import NO_SOCKET, RowTable, with_attributes
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 SEPARATOR = "/"
 """Between the name of a place and that of a socket: "front/0"."""
 Distances = Mapping[tuple[str, str], float]
+ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
+"""Attributes of rows that were measured in one set-up."""
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (
@@ -85,14 +87,19 @@ class SocketTable(RowTable):
     flattery = FLATTERY
 
     points: Tensor
-    std: Tensor | None
-    marker_names: tuple[str, ...] | None
-    on: tuple[str, ...] | None
-    session: Tensor | None
-    session_names: tuple[str, ...]
-    remounted: bool
-    socket: Tensor | None
-    sockets: Sockets | None
+    frames: Any
+    poses: Tensor | None = None
+    lever: float | None = None
+    board: Tensor | None = None
+    std: Tensor | None = None
+    rotation_std: Tensor | None = None
+    marker_names: tuple[str, ...] | None = None
+    on: tuple[str, ...] | None = None
+    session: Tensor | None = None
+    session_names: tuple[str, ...] = ()
+    remounted: bool = False
+    socket: Tensor | None = None
+    sockets: Sockets | None = None
 
     @property
     def markers(self) -> int:
@@ -124,9 +131,7 @@ class SocketTable(RowTable):
     @property
     def row_sockets(self) -> list[str]:
         """(N,) name of the socket of each row, "" where a device measured."""
-        if self.socket is None or self.sockets is None:
-            return [""] * len(self)
-        return ["" if number == NO_SOCKET else self.sockets.names[number] for number in self.socket.tolist()]
+        return texts_of(self.socket, () if self.sockets is None else self.sockets.names, len(self))
 
     @property
     def known_sockets(self) -> Sockets:
@@ -154,11 +159,10 @@ class SocketTable(RowTable):
         """The rows whose positions a device measured, without the ball; the table itself if it has no sockets."""
         if self.socket is None:
             return self
-        rows = self.rows((self.socket == NO_SOCKET).nonzero()[:, 0].tolist())
-        changes = {"socket": None, "sockets": None, "points": rows.points[:, :-1]}
-        changes |= {} if rows.std is None else {"std": rows.std[:, :-1]}
-        names = {name: getattr(rows, name) for name in ("marker_names", "on")}
-        return with_attributes(rows, **changes, **{name: own and own[:-1] for name, own in names.items()})
+        rows = self.rows(self.socket == NO_SOCKET)
+        names = {name: own and own[:-1] for name, own in (("marker_names", rows.marker_names), ("on", rows.on))}
+        std = None if rows.std is None else rows.std[:, :-1]
+        return with_attributes(rows, socket=None, sockets=None, points=rows.points[:, :-1], std=std, **names)
 
     def socket_rows(self) -> Self:
         """The rows whose ball rested in sockets, with the ball alone; MeasurementError if there are none."""
@@ -166,14 +170,9 @@ class SocketTable(RowTable):
             raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
         if self.without_device and self.markers == 1:
             return self
-        rows = self.rows((self.socket != NO_SOCKET).nonzero()[:, 0].tolist())
+        rows = self.rows(self.socket != NO_SOCKET)
         changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
         return with_attributes(rows, **changes, session=None, session_names=())
-
-    @property
-    def resting(self) -> tuple[Self, ...]:
-        """See :attr:`RowGroups.resting`."""
-        return () if self.socket is None or not bool((self.socket != NO_SOCKET).any()) else (self.socket_rows(),)
 
     def with_sockets_of_rows(self) -> Self:
         """The same rows without the sockets that hold the ball in none of them, and without distances to these."""
@@ -187,23 +186,18 @@ class SocketTable(RowTable):
         distances = tuple((new[a], new[b], d) for a, b, d in self.sockets.distances if a in new and b in new)
         return with_attributes(self, socket=numbers, sockets=Sockets(names, distances, self.sockets.distance_std))
 
-    def with_hidden_ball(self) -> Self:
-        """Measured positions with a ball that no row shows as their last marker."""
-        none = self.points.new_full((len(self), 1, 3), torch.nan)
-        changes: dict[str, object] = {"points": torch.cat([self.points, none], dim=1)}
-        if self.std is not None:
-            changes["std"] = torch.cat([self.std, none], dim=1)
-        if self.marker_names is not None:
-            changes["marker_names"] = (*self.marker_names, BALL)
-        if self.on is not None:
-            changes["on"] = (*self.on, self.on[-1])
-        return with_attributes(self, **changes)
-
-    def with_hidden_markers(self, markers: int) -> Self:
-        """Rows in sockets with this many markers before the ball that no row shows."""
-        none = self.points.new_full((len(self), markers, 3), torch.nan)
-        points = torch.cat([none, self.points], dim=1)
-        return with_attributes(self, points=points, marker_names=None, on=None)
+    def with_markers(self, count: int) -> Self:
+        """The rows with this many markers, the ball last: those that rows of one kind do not show are hidden."""
+        if self.sockets is not None:
+            lacking = count - 1 if self.markers == 1 else 0
+            changes: dict[str, object] = {"marker_names": None, "on": None} if lacking else {}
+            return with_attributes(self, points=_padded(self.points, lacking, 0), **changes)
+        if self.markers != count - 1:
+            return self
+        names = self.marker_names and (*self.marker_names, BALL)
+        changes = {"marker_names": names, "on": self.on and (*self.on, self.on[-1])}
+        std = None if self.std is None else _padded(self.std, 0, 1)
+        return with_attributes(self, points=_padded(self.points, 0, 1), std=std, **changes)
 
     @classmethod
     def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
@@ -211,23 +205,22 @@ class SocketTable(RowTable):
         device = [table for table in tables if table.sockets is None]
         known = [table for table in tables if table.sockets is not None]
         if not known or (not device and len({table.markers for table in tables}) == 1):
-            return tables
-        both = device[0].with_hidden_ball() if device else max(known, key=lambda table: table.markers)
-        none = [torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST) for table in tables]
-        return [table._beside(both, known[0].sockets, own) for table, own in zip(tables, none, strict=True)]
-
-    def _beside(self, other: SocketTable, sockets: Sockets | None, none: Tensor) -> Self:
-        """The rows with the markers of other rows, hidden where these rows do not have them; ``none``: (N,) of -1."""
-        if self.sockets is None:
-            return with_attributes(self.with_hidden_ball(), socket=none, sockets=sockets)
-        if self.markers > 1:
-            return self
-        shown = self.with_hidden_markers(other.markers - 1)
-        changes: dict[str, object] = {"marker_names": other.marker_names, "on": other.on}
-        changes |= {} if other.std is None else {"std": torch.full_like(shown.points, torch.nan)}
-        changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
-        changes["remounted"] = other.remounted
-        return with_attributes(shown, **changes)
+            return super().of_one_layout(tables)
+        most = max(known, key=lambda table: table.markers)
+        both = device[0].with_markers(device[0].markers + 1) if device else most
+        found = []
+        for table in tables:
+            none = torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST)
+            shown = table.with_markers(both.markers if table.sockets is not None else table.markers + 1)
+            changes: dict[str, object] = {}
+            if table.sockets is None:
+                changes = {"socket": none, "sockets": known[0].sockets}
+            elif table.markers == 1:
+                changes = {"marker_names": both.marker_names, "on": both.on, "remounted": both.remounted}
+                changes |= {} if both.std is None else {"std": torch.full_like(shown.points, torch.nan)}
+                changes |= {} if both.session is None else {"session": none, "session_names": both.session_names}
+            found.append(with_attributes(shown, **changes))
+        return super().of_one_layout(found)
 
 
 def socket_numbers(
@@ -242,6 +235,11 @@ def socket_numbers(
     numbers = {name: number for number, name in enumerate(known)}
     own = torch.tensor([numbers[text] for text in texts], dtype=torch.int64, device=HOST)
     return own, Sockets(known, *_checked_distances(known, distances, distance_std))
+
+
+def _padded(values: Tensor, before: int, after: int) -> Tensor:
+    """Values (N, P, 3) with hidden markers before and after."""
+    return torch.nn.functional.pad(values, (0, 0, before, after), value=torch.nan)
 
 
 def _place(name: str) -> str:

@@ -16,41 +16,47 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.bodies import Bodies, bodies_of
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
     check_size,
+    checked_names,
+    deviations,
     joint_table,
-    marker_deviations,
     marker_places,
+    of_measurements,
     seen_markers,
     session_numbers,
+    texts_of,
     tip_names,
-    unique_names,
 )
-from diffeo_calib.measurements.images import IMAGE_COLUMNS, NO_IMAGES, ImageTable
+from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     block_diagonal,
     by_frame,
+    checked_frames,
     frame_tips,
     frames_of_points,
+    inverse_poses,
     of_frames,
-    pose_columns,
+    points_of_frames,
     pose_jacobian,
     visible_rotation_numbers,
 )
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings, as_readings
-from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.sockets import Distances, SocketTable, socket_numbers
+from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
+
+XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(ImageTable, SocketTable):
+class Measurements(ImageTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -95,13 +101,11 @@ class Measurements(ImageTable, SocketTable):
     """
 
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
-    BY_ROW = (*BY_ROW, "covariates", *IMAGE_COLUMNS)
+    BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
 
-    poses: Tensor | None
-    lever: float | None
-    rotation_std: Tensor | None
+    NUMBERED = "session", "session_names"
 
     def __init__(
         self,
@@ -118,14 +122,11 @@ class Measurements(ImageTable, SocketTable):
         places = marker_places(points).to(angles.device)
         check_rows(angles, places, "points")
         check_size(places, "points")
-        markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = marker_deviations(std, places)
+        markers = checked_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
+        known = deviations(std, "std", places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        set_attributes(self, session=None, session_names=(), remounted=False, socket=None, sockets=None)
-        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             self.check_every_marker_seen()
             self.warn_if_suspicious()
@@ -169,9 +170,26 @@ class Measurements(ImageTable, SocketTable):
                 standard deviation that is not positive.
         """
         angles, joints = joint_table(q, joint_names)
-        columns = pose_columns(angles, poses, lever, position_std, rotation_std, camera_on_tool=camera_on_tool)
-        data = cls(angles, columns["points"], joints, doubt=False)
-        data = with_attributes(data, **columns, lever=float(lever)).with_tips(on)
+        with of_measurements():
+            frames, board = checked_frames(poses).to(angles.device), None
+            if camera_on_tool:
+                if frames.shape[1] > 1:
+                    what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
+                    fix += " poses of the cameras in the board's frame"
+                    raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
+                frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
+            points = points_of_frames(frames, lever)
+        check_rows(angles, frames, "poses")
+        places = frames[..., :3, 3]
+        like = places if places.shape[1] > 1 else places[:, 0]
+        known = deviations(position_std, "position_std", like)
+        std, turns = (
+            known if known is None else known.view(places.shape),
+            deviations(rotation_std, "rotation_std", like),
+        )
+        data = cls(angles, points, joints, doubt=False)
+        found = {"poses": of_frames(frames), "lever": float(lever), "board": board, "std": std, "rotation_std": turns}
+        data = with_attributes(data, **found).with_tips(on)
         if doubt:
             data.check_every_marker_seen()
             data.warn_if_suspicious()
@@ -290,7 +308,7 @@ class Measurements(ImageTable, SocketTable):
     @property
     def bodies(self) -> Bodies:
         """Bodies in the rows: markers, or frames."""
-        return bodies_of(self.lever)
+        return Bodies(self.lever)
 
     @property
     def origins(self) -> Tensor:
@@ -334,12 +352,12 @@ class Measurements(ImageTable, SocketTable):
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the set-up in which each row was measured, "" without one."""
-        numbers = [-1] * len(self) if self.session is None else self.session.tolist()
-        return ["" if number < 0 else self.session_names[number] for number in numbers]
+        return texts_of(self.session, self.session_names, len(self))
 
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowTable`."""
+        return torch.cat([self.q, self.points.flatten(1)], dim=1)
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
@@ -357,21 +375,14 @@ class Measurements(ImageTable, SocketTable):
         return f"Measurements({', '.join(parts)})"
 
     @property
-    def position_names(self) -> list[tuple[str, ...]]:
-        """Columns x, y, z of each marker or frame: NAME_x, ... of several, TIP_x, ... of frames; none for a ball."""
-        if self.poses is not None:
-            return [(f"{prefix}x", f"{prefix}y", f"{prefix}z") for prefix in self.frame_prefixes]
-        measured = self.markers - (self.sockets is not None)
-        if measured == 1 and self.marker_names is None:
-            return [("x", "y", "z")]
-        markers = (self.marker_names or [f"marker{k + 1}" for k in range(measured)])[:measured]
-        return [(f"{name}_x", f"{name}_y", f"{name}_z") for name in markers]
-
-    @property
-    def frame_prefixes(self) -> list[str]:
-        """Prefix of the columns of each measured frame: empty for a single one, else TIP_."""
-        frames = 0 if self.frames is None else self.frames.shape[1]
-        return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+    def prefixes(self) -> list[str]:
+        """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_; not of a ball."""
+        if self.frames is not None:
+            frames = self.frames.shape[1]
+            return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+        seen = self.markers - (self.sockets is not None)
+        plain = [""] if seen == 1 else [f"marker{k + 1}_" for k in range(seen)]
+        return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names[:seen]]
 
     def measured(self) -> dict[str, Any]:
         """Sockets, positions and rotation vectors rx, ry, rz, known standard deviations as std_x, ..., and sessions.
@@ -380,8 +391,7 @@ class Measurements(ImageTable, SocketTable):
         camera's axes.
         """
         columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
-        names = [name for triple in self.position_names for name in triple]
-        turns = [f"{prefix}{name}" for prefix in self.frame_prefixes for name in ("rx", "ry", "rz")]
+        names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
             columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
@@ -459,7 +469,7 @@ class Measurements(ImageTable, SocketTable):
         """The rows with their first markers moved, (N, P, 3) m, as one session."""
         rest = self.points[:, shifts.shape[1] :]
         points = torch.cat([self.points[:, : shifts.shape[1]] + shifts, rest], 1)
-        return with_attributes(self, points=points, session=None, session_names=(), remounted=False)
+        return with_attributes(self, points=points, **ONE_SESSION)
 
     def in_frames(self, transforms: Tensor) -> Measurements:
         """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.
@@ -469,14 +479,8 @@ class Measurements(ImageTable, SocketTable):
         """
         T = transforms.to(self.points)
         R, shift = T[:, :3, :3], T[:, None, :3, 3]
-        changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
-        changes["remounted"] = False
+        changes = ONE_SESSION | {"points": self.points @ R.mT + shift}
         changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses
-        if self.std is not None and self.board is None:
-            changes["std"] = (self.std.square() @ R.square().mT).sqrt()
-        if self.rotation_std is not None and self.board is None:
-            variances = self.rotation_std.view(len(self), -1, 3).square()
-            changes["rotation_std"] = (variances @ R.square().mT).sqrt().view_as(self.rotation_std)
         return with_attributes(self, **changes)

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
+from diffeo_calib.common.errors import MeasurementError, as_written, listed
+from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_euler, numbers_of
 
 Names = Sequence[str] | Sequence[Sequence[str]]
@@ -105,12 +106,13 @@ class TableFormat:
         if self.convention is None:
             what = "`rotation` is given, but its `convention` is not"
             raise MeasurementError.of(what, expected=CONVENTIONS, fix="name it: it is never guessed")
-        count = _count(self.convention)
+        with of_measurements():
+            count = numbers_of(self.convention)
         expected = f"{count} names of columns for {self.convention!r}"
-        rotation = _by_frame("rotation", self.rotation, expected, count)
+        rotation = by_frame("rotation", self.rotation, expected, count)
         std = self.rotation_std
         if std is not None:
-            std = _by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
+            std = by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
         self._check_rotation_unit(has_angles=count == 3)
         return replace(self, rotation=rotation, rotation_std=std)
 
@@ -125,15 +127,17 @@ class TableFormat:
             MeasurementError: an unknown convention or unit, or a wrong number of names.
         """
         convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
-        count = _count(convention)
+        with of_measurements():
+            count = numbers_of(convention)
         check_choice("rotation_angle", unit, ANGLE_UNITS)
         plain = _rotation_names(convention)
-        names = _by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
+        names = by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
         std = None
         if rotation_std:
             given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
-            std = _by_frame("rotation_std", given, "three names", 3)
-        return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
+            std = by_frame("rotation_std", given, "three names", 3)
+        angle = unit if count == 3 or rotation_std else None
+        return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
 
     def _check_rotation_unit(self, *, has_angles: bool) -> None:
         """The unit of a rotation must be named where there are angles, and only there."""
@@ -154,16 +158,15 @@ def flat_names(names: Names | None) -> tuple[str, ...]:
     return tuple(name for group in names or () for name in ([group] if isinstance(group, str) else group))
 
 
-def _by_frame(what: str, names: object, expected: str, *counts: int) -> Names:
-    """Checked names of so many columns, or a tuple of equally many such names for each of several frames."""
-    groups = list(names) if isinstance(names, Sequence) and not isinstance(names, str) else []
-    if not groups or any(isinstance(group, str) or not isinstance(group, Sequence) for group in groups):
-        return column_names(what, names, expected, counts)
-    groups = tuple(column_names(what, group, expected, counts) for group in groups)
+def by_frame(what: str, names: object, expected: str, *counts: int) -> tuple[tuple[str, ...], ...]:
+    """Checked names of so many columns of each marker or frame; a list of names is that of the only one."""
+    given = list(names) if isinstance(names, Sequence) and not isinstance(names, str) else []
+    several = given and not any(isinstance(group, str) or not isinstance(group, Sequence) for group in given)
+    groups = tuple(column_names(what, group, expected, counts) for group in (given if several else [names]))
     if len({len(group) for group in groups}) > 1:
         got = " and ".join(str(len(group)) for group in groups)
         raise MeasurementError.of(f"`{what}`", expected="as many names for every frame", got=got)
-    return groups[0] if len(groups) == 1 else groups
+    return groups
 
 
 def _prefixed(prefixes: Sequence[str], names: Sequence[str], before: str = "") -> Names:
@@ -190,14 +193,6 @@ def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
     if value not in allowed:
         expected = " or ".join(repr(choice) for choice in allowed)
         raise MeasurementError.of(f"`{name}`", expected=expected, got=as_written(value), fix="pass one of these")
-
-
-def _count(convention: object) -> int:
-    """Numbers that write one rotation."""
-    try:
-        return numbers_of(convention)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
 
 
 def _rotation_names(convention: str) -> tuple[str, ...]:

@@ -120,7 +120,7 @@ class Positions(Sensor):
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With a hidden ball where the model has one more point."""
-        return data.with_hidden_ball() if model.ball and data.markers == model.markers - 1 else data
+        return data.with_markers(model.markers) if model.ball else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of set-ups: those that the model knows stay, the others are found.
@@ -222,7 +222,7 @@ class Contacts(Sensor):
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With hidden markers before the ball."""
         self.check(data, model)
-        return data.with_hidden_markers(model.markers - 1) if data.markers == 1 < model.markers else data
+        return data.with_markers(model.markers)
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
@@ -408,14 +408,14 @@ def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
         MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
             say on which of them their markers are.
     """
-    bodies = data.bodies
+    bodies, one = data.bodies, "marker" if data.lever is None else "frame"
     if data.on is not None and not set(data.on) <= set(robot.tips):
-        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {bodies.one}"
+        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {one}"
         got = listed(data.on[:: bodies.points])
         raise MeasurementError.of(what, expected=f"names among {listed(robot.tips)}", got=got, fix=fix)
     if data.on is None and len(robot.tips) > 1:
         what = f"robot '{robot.name}' has {len(robot.tips)} tips ({listed(robot.tips)})"
-        fix = f"pass {bodies.maker}(..., on=[...]) with the tip of every {bodies.one}"
+        fix = f"pass Measurements{'.from_poses' * (data.lever is not None)}(..., on=[...]) with the tip of every {one}"
         what += f", and the measurements do not say on which of them their {bodies.many} are"
         raise MeasurementError.of(what, fix=fix)
     return data.on or (robot.tip,) * data.markers

@@ -210,7 +210,8 @@ class MeasuringFrames(SetUps):
         check_same_markers(predicted, data.points)
         rows = [(own == place).to(predicted.device) for place in range(len(names))]
         found = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
-        free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not data.same_tool)
+        cameras = set(data.session_names) <= set(data.cameras)  # nothing on the tool was mounted again between these
+        free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not cameras)
         return cls(names, found, found[:, :0], turns, names, free)
 
     def aligned(self, data: Measurements) -> Measurements:

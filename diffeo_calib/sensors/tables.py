@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.measurements.observations import Observations, unmixed
+from diffeo_calib.measurements.observations import Observations, Rows, unmixed
 from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
@@ -19,25 +18,8 @@ from diffeo_calib.sensors.kinds import kind_of
 ORDER = {"position": 0, "pose": 0, "socket": 1}
 
 
-class Coordinates(NamedTuple):
-    """Rows that tell coordinates: positions, poses, a ball in sockets; and their numbers (M,) in the whole table."""
-
-    table: Measurements
-    rows: Tensor
-
-
-class OtherReadings(NamedTuple):
-    """Readings of one kind, and their numbers (M,) in the whole table."""
-
-    table: Readings
-    rows: Tensor
-
-
-class Rows(NamedTuple):
-    """Rows of one kind, and their numbers (M,) in the whole table."""
-
-    table: Any
-    rows: Tensor
+Coordinates = OtherReadings = Rows
+"""Rows that tell coordinates, of positions, poses and a ball in sockets; readings of one kind."""
 
 
 def rows_of_one_kind(data: Any) -> list[Rows]:
@@ -65,10 +47,7 @@ def with_markers(table: Measurements, markers: int, lever: float | None = None) 
     """
     if table.frames is not None and lever is not None:
         table = with_attributes(table, points=points_of_frames(table.frames, lever), lever=lever)
-    if table.sockets is not None:
-        table = table.with_sockets_of_rows()
-        return table.with_hidden_markers(markers - 1) if table.markers == 1 < markers else table
-    return table.with_hidden_ball() if table.markers == markers - 1 else table
+    return table.with_sockets_of_rows().with_markers(markers)
 
 
 def measured_rows(table: Measurements) -> Coordinates | None:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import transforms
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
 
 Reader = Callable[..., Measurements]
 JOINTS, POSITION = ["q1", "q2"], ["x", "y", "z"]
@@ -25,6 +30,12 @@ def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements
     """Distinct random measurements."""
     rng = np.random.default_rng(seed)
     return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
+
+
+def read_table(path: Path, joints: Any, position: Any, table: TableFormat, **how: Any) -> Measurements:
+    """Positions or poses in a format; options are those of the columns, and duplicates."""
+    duplicates = how.pop("duplicates", "error")
+    return read_observations(path, TableColumns(joints, position, **how), table, duplicates=duplicates)
 
 
 def random_rotations(count: int, seed: int = 0) -> Tensor:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from product_bank import simulated_poses, sliding_measurements, sliding_robot
+from table_bank import read_table
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
@@ -21,7 +22,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     warn_of_joints_below_tip,
 )
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_table, write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.joint import Joint

@@ -175,7 +175,7 @@ def test_a_column_of_the_table(table: dc.Measurements, command: Command) -> None
     assert done.code == 0, done.err
     assert "its frame is" in done.out
     wrong = command(*options, "--session", "night")
-    assert "column 'night': expected one column of this name" in wrong.err
+    assert "no column ['night']" in wrong.err
 
 
 def test_sessions_of_the_fit_are_evaluated_where_it_found_them(

@@ -93,7 +93,7 @@ def test_wrong_options(options: list[str], message: str, small_site: Site, comma
         (["--rotation-std", "a,b,c"], r"--rotation-std without --rotation"),
         (["--std", "a,b"], r"--std: expected names of columns: one, one per marker or three per marker"),
         (["--std", "s"], r"no column \['s'\]"),
-        (["--std", "k"], r"line 2, column 'k': expected a positive standard deviation, got 0 "),
+        (["--std", "k"], r"line 2, column 'k'.*: expected a positive standard deviation, got '0'"),
         (
             ["--rotation", "i,j,k,l", "--convention", "quat_xyzw"],
             r"line 2, columns i, j, k, l: .*quaternion",

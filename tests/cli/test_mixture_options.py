@@ -120,7 +120,7 @@ def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyP
     ("change", "message"),
     [
         (lambda cells: [*cells[:8], "", "", ""], r"line 2: expected a position or a socket, got neither"),
-        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column 'socket': expected a name"),
+        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column .socket.: expected the name"),
         (lambda cells: [*cells[:9], "", ""], r"line 2, column 'y'.*: expected a finite number, got an empty cell"),
     ],
 )  # fmt: skip
@@ -137,7 +137,7 @@ def test_lines_of_one_kind(
 def test_tables_of_one_kind_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     header, *lines = (folder / "t.csv").read_text().split("\n")
-    for start, message in (("", "no line names a socket"), ("spot", "columns x, y, z: empty in all 12 lines")):
+    for start, message in (("", "no line holds a socket"), ("spot", "columns x, y, z: empty in all 12 lines")):
         kept = [line for line in lines if line.startswith("spot") == bool(start)]
         (folder / "one.csv").write_text("\n".join([header, *kept]))
         with pytest.raises(MeasurementError, match=message):

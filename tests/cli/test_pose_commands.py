@@ -20,12 +20,12 @@ from command_bank import (
 )
 from product_bank import simulated_poses
 from server_bank import Server
-from table_bank import CONVENTIONS
+from table_bank import CONVENTIONS, read_table
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.cli.commands.predict import reading_options
-from diffeo_calib.measurements.csv.files import read_table, write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.sensors.errors import Evaluation

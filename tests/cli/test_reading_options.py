@@ -94,14 +94,14 @@ def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
     ("options", "message"),
     [
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
-        ([*WIRE, "--socket", "a,b"], "column 'a': expected one column of this name"),
+        ([*WIRE, "--socket", "a,b"], "no column ['a', 'b']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
         (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
         (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "image=u,v,9,9,2,x"], "--reading image=u,v,9,9,2,x: expected"),
-        (["--reading", "distance=rope"], "column 'rope': expected one column of this name"),
-        (["--reading", "distance=anchor"], "line 2, column 'anchor': expected a number, got 'A'"),
+        (["--reading", "distance=rope"], "no column ['rope']"),
+        (["--reading", "distance=anchor"], "expected a number, got 'A'"),
         (
             ["--reading", "distance=0"],
             "--reading distance=0: expected a distance above 0; write the length of the ball bar",

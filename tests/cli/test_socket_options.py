@@ -69,7 +69,7 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
         ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
         (["--distance", "a,b=50", "--position", "x,y,z"], "--distance without --socket"),
-        (["--socket", "place,hole"], "column 'hole': expected one column of this name"),
+        (["--socket", "place,hole"], "no column ['hole']"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
         (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std; say how well"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),

@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.bodies import bodies_of, seen_board
+from diffeo_calib.measurements.bodies import Bodies, seen_board
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -39,7 +39,7 @@ def test_markers_and_frames_have_names_and_numbers() -> None:
     single = dc.Measurements.from_poses(Q, POSES[:, 0], doubt=False)
     assert single.bodies.labels(single) == [(None, None)]
     named = TIPS.with_tips(None)
-    assert named.bodies.labels(named.bodies.on_tips(named, TIPS.on or ())) == TIPS.bodies.labels(TIPS)
+    assert named.bodies.labels(named, TIPS.on) == TIPS.bodies.labels(TIPS)
 
 
 def test_only_markers_can_be_those_of_the_other_hand() -> None:
@@ -102,7 +102,7 @@ def test_points_become_poses_with_a_lever() -> None:
 def test_origins_are_linear_in_points(lever: float | None, table: dc.Measurements) -> None:
     flat = table.points.flatten(1)
     expected = flat if lever is None else POSES[..., :3, 3].flatten(1)
-    assert_close(flat @ bodies_of(lever).averaging(flat).mT, expected)
+    assert_close(flat @ Bodies(lever).averaging(flat).mT, expected)
 
 
 def test_only_a_camera_on_the_tool_sees_a_board() -> None:

@@ -169,14 +169,14 @@ def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
     ("edit", "said"),
     [
         (("0.3,0.4,1,2,4,1.7", "0.3,0.4,,,,"), "line 4: expected a position, a socket, a distance or an image"),
-        (("7,8,,C", "7,,,C"), "line 5, column 'v': expected a number, got an empty cell"),
+        (("7,8,,C", "7,,,C"), "line 5, column 'v': expected a finite number, got an empty cell"),
         (("1,2,3,", "1,,3,"), "line 2, column 'y'"),
         (("1.5,,,,A", "far,,,,A"), "line 3, column 'd': expected a number, got 'far'"),
         (("1.5,,,,A", "1.5,,,,"), "line 3, column 'who': expected the name of the device of this reading"),
         (("1.5,,,,A", "-1.5,,,,A"), "line 3, column 'd': expected a distance above 0, got '-1.5'"),
-        (("A,0.1", "A,"), "line 3, column 'sd': expected a positive standard deviation, got an empty cell"),
+        (("A,0.1", "A,"), "line 3, column 'sd': expected a finite number, got an empty cell"),
         (("A,0.1", "A,-1"), "line 3, column 'sd': expected a positive standard deviation, got '-1'"),
-        (("7,8,,C", ",,s0,"), "no line holds an image"),
+        (("7,8,,C", ",,s0,"), "columns u, v: empty in all 5 lines: expected some line that holds an image"),
         (("0.5,0.6,,,,,,,s0,,", "0.5,0.6,,,,,,,s0,"), "line 6: expected 11 cells as in the header"),
         (("0.5,0.6,,,,,,,s0,,", "0.2,0.3,,,,1.5,,,,A,0.1\n0.7,0.6,,,,,,,s0,,"), "line 6 repeats 3"),
     ],
@@ -193,7 +193,7 @@ def test_bad_descriptions(tmp_path: Path) -> None:
         (replace(COLUMNS, readings=(plane,)), "one height for all rows beside rows of other kinds"),
         (replace(COLUMNS, position=None, session="who"), "`session` beside `socket`"),
         (TableColumns(NAMES, readings=(WIRE,), session="who"), "`session` beside `readings`"),
-        (replace(COLUMNS, readings=(replace(WIRE, values=("rope",)),)), "column 'rope': expected one column"),
+        (replace(COLUMNS, readings=(replace(WIRE, values=("rope",)),)), "no column ['rope']"),
     ):
         with pytest.raises(MeasurementError, match=says(said)):
             read(tmp_path, LINES, columns)
@@ -211,7 +211,7 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         (both, {}, "write them to two files"),
         (positions(), {"session": "who"}, "`session`: got a table without set-ups"),
         (heights(), {"position": list("xyz")}, "`position`: got a table without positions"),
-        (clash, {}, "expected distinct names: 'height'"),
+        (clash, {}, "expected distinct columns: 'height'"),
         (lengths(), {"joints": ["a"]}, "joint columns: expected 2"),
     )
     for data, options, said in wrong:
@@ -262,3 +262,14 @@ def test_poses_beside_sockets_and_payloads(tmp_path: Path) -> None:
     assert isinstance(found, Observations)
     assert found.kinds == ("pose", "socket")
     assert held(found.payload).tolist() == [1.0, 2.0]
+
+
+def test_kinds_share_a_column_of_deviations_in_one_unit_alone(tmp_path: Path) -> None:
+    text = "a,b,d,h,sd,who\n0,1,5,,0.1,A\n1,2,,7,0.2,B\n"
+    wire = ReadingColumns("distance", ("d",), "who", std=("sd",))
+    plane = replace(wire, kind="height", values=("h",))
+    data = read(tmp_path, text, TableColumns(NAMES, readings=(wire, plane)))
+    assert [held(part.std).tolist() for part in data.parts] == [[[0.1]], [[0.2]]]
+    angle = replace(plane, kind="angle", unit=("mrad", 1e3))
+    with pytest.raises(MeasurementError, match=says("distinct columns", "'sd'")):
+        read(tmp_path, text, TableColumns(NAMES, readings=(wire, angle)))

@@ -130,11 +130,11 @@ def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: 
     [
         (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,,30,1\n", {}, ("line 3, column 'b'", "an empty cell")),
         (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,nan,30,1\n", {}, ("line 3, column 'b'", "'nan'")),
-        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "positive", "0;")),
+        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "got '0'")),
         (
             POSE_HEADER + "0,0,1,2,3,10,2,30,-1\n" * 2,
             {"std": ["d"], "duplicates": "keep"},
-            ("line 2, column 'd'", "got -1 (2 such cells)"),
+            ("line 2, column 'd' (and 1 more, on line 3)", "got '-1'"),
         ),
         (
             MATRIX_HEADER + "0,0,1,2,3,1,0,0,0,1,0,0,0,1\n0,0,1,2,3,1,0,0,0,1,0,0,0,-1\n",

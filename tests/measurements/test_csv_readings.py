@@ -63,8 +63,8 @@ def test_one_number_for_all_rows_and_pixels(table: Path) -> None:
     ("edit", "said"),
     [
         (("410,5", "410.5"), "line 4, column 'd': expected a number, got '410.5'"),
-        (("410,5", "nan"), "line 4, column 'd': expected a number"),
-        (("410,5", ""), "line 4, column 'd': expected a number, got an empty cell; every line is one reading of one"),
+        (("410,5", "nan"), "line 4, column 'd': expected a finite number, got 'nan'"),
+        (("410,5", ""), "line 4, column 'd': expected a finite number, got an empty cell; remove or repair"),
         (("south", " "), "line 4, column 'where': expected the name of the device of this reading, got an empty cell;"),
         (("north", ""), r"line 2, column 'where' \(and 1 more, on line 5\): expected the name of the device"),
         (("410,5", "-1"), "line 4, column 'd': expected a distance above 0, got '-1'; repair or remove these lines"),

@@ -12,11 +12,11 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from table_bank import JOINTS, POSITION, held, says, some
+from table_bank import JOINTS, POSITION, held, read_table, says, some
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table import Measurements

@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 from product_bank import sliding_measurements, sliding_robot
-from table_bank import HEADER, Reader
+from table_bank import HEADER, Reader, read_table
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.cli.options import Correction, Units
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_table, write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.writing import Program, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 

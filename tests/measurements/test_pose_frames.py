@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from table_bank import CONVENTIONS, held, random_poses, says
+from table_bank import CONVENTIONS, held, random_poses, read_table, says
 from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.pose_frames import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -137,7 +137,7 @@ def test_frames_in_a_data_frame() -> None:
         (lambda poses: poses.index_fill(0, torch.tensor(4), torch.nan), {}, ("`poses`, row 4: no frame was seen",)),
         (lambda poses: poses.index_fill(1, torch.tensor(1), torch.nan), {}, ("the frame on 'right'", "all 6 rows")),
         (lambda poses: poses * 2, {}, ("`poses`, row 0, frame 0", "[0, 0, 0, 1]")),
-        (lambda poses: poses, {"on": ["left"]}, ("`on`", "expected 3 names", "every measured frame")),
+        (lambda poses: poses, {"on": ["left"]}, ("`on`", "expected 3 names", "per measured frame")),
         (lambda poses: poses, {"position_std": -1.0}, ("`position_std`", "positive")),
     ],
 )
@@ -160,7 +160,11 @@ ROW = "0.1,1,2,3,0.1,0.2,0.3,1,2,3,0.1,0.2,0.3\n"
         (HEADER + ROW, {"rotation_std": ["A", "B", "C"]}, ("`position` beside `rotation_std`", "1 list")),
         (HEADER + ROW + "1,,,,,,,1,2,3,0,,0\n", {}, ("line 3, column 'B'", "an empty cell")),
         (HEADER + ROW + "1,,,,,,0,1,2,3,0,0,0\n", {}, ("line 3, column 'x'", "an empty cell")),
-        (HEADER + "1,,,,,,,1,2,3,0,0,0\n", {}, ("columns x, y, z, a, b and 1 more", "leave this frame out")),
+        (
+            HEADER + "1,,,,,,,1,2,3,0,0,0\n",
+            {},
+            ("columns x, y, z, a, b and 1 more", "shows this frame; leave them out"),
+        ),
     ],
 )
 def test_wrong_tables_are_one_clear_error(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from table_bank import says, some
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 

@@ -445,4 +445,4 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     bad[:, -1] = judged & (squares > limit)
     distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
     placed = with_attributes(resting, points=middles[:, None])
-    return found_outliers(model, placed.with_hidden_markers(model.markers - 1), bad, distances)
+    return found_outliers(model, placed.with_markers(model.markers), bad, distances)

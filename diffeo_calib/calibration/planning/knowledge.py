@@ -39,7 +39,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
@@ -254,9 +254,7 @@ def of_robot(
     data = replace(data, held=held_parameters(geometry) if adrift else ())
     values = (data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T
     known, noise = Known(data.linearisation(scales), values, torch.ones_like(values[:, 0])), data.noise(scales)
-    scene = Scene(
-        data.points, noise, geometry.base, bodies_of(lever).averaging(noise), 3 * len(tool.points), free=adrift
-    )
+    scene = Scene(data.points, noise, geometry.base, Bodies(lever).averaging(noise), 3 * len(tool.points), free=adrift)
     return Start(known, scene)
 
 

@@ -106,8 +106,7 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
     found: list[Outlier] = []
     for one in errors.values():
         found += contradicted(model, one.rows) if one.one.what == ERRORS else []
-        for resting in one.rows.resting:
-            found += contradicted_in_sockets(model, resting)
+        found += contradicted_in_sockets(model, one.rows)
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 

@@ -37,7 +37,7 @@ OWN_FRAME = (
 def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> None:
     """Find all mistakes in a table, and warn of rows outside the joint ranges of the fit."""
     outside = OutsideRange(model)
-    file.check(lambda values: outside.add(values.q), lambda part: progress("checking, %", int(100 * part), 100))
+    file.check(lambda values: outside.add(values["q"]), lambda part: progress("checking, %", int(100 * part), 100))
     outside.refuse_other_unit()
     outside.warn()
 

@@ -15,7 +15,7 @@ from diffeo_calib.kinematics.re_registration.estimate import Session, View, anyw
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, turned
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_poses
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.measurements.bodies import Body, bodies_of
+from diffeo_calib.measurements.bodies import Bodies, Body
 from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
@@ -48,7 +48,7 @@ def session_of(
     """
     before, fit = model.registration, model.unregistered
     markers = _markers(fit, nominal) if before is None else before.markers
-    own, seen = bodies_of(lever), data.bodies
+    own, seen = Bodies(lever), data.bodies
     known = own.kind == seen.kind and data.markers == len(markers)
     if known:
         data, seen = own.represented(data), own

@@ -16,11 +16,10 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, NamedTuple, TextIO
 
 import torch
 from torch import Tensor
@@ -42,7 +41,7 @@ class CsvLines:
     """A CSV file (UTF-8, one header line, blank lines skipped), used as a context.
 
     Args:
-        path: the file. What can be read only once, such as a pipe, is copied while it is read the first time.
+        path: the file. What can be read only once, such as a pipe, is copied first.
         sep: one character between cells.
 
     Attributes:
@@ -59,15 +58,15 @@ class CsvLines:
         self.path, self.sep = path, sep
         self._stack = ExitStack()
         self._file: TextIO
-        self._copy: TextIO | None = None
-        self._read_once = False
-        self._first: Iterator[tuple[int, list[str]]]
 
     def __enter__(self) -> Self:
         with self._stack as stack:  # closed if the header cannot be read
             self._file = stack.enter_context(self._open())
-            self._first = self._cells()
-            header = next(self._first, None)
+            if not self._file.seekable():
+                copy = stack.enter_context(tempfile.TemporaryFile("w+", encoding="utf-8", newline=""))
+                copy.writelines(self._texts())
+                self._file = copy
+            header = next(self._cells(), None)
             if header is None:
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
@@ -80,22 +79,13 @@ class CsvLines:
 
     @property
     def progress(self) -> float:
-        """Fraction of the file that has been read; 0 for a pipe."""
+        """Fraction of the file that has been read."""
         size = os.fstat(self._file.fileno()).st_size
-        return min(self._file.buffer.tell() / size, 1.0) if size and self._file.seekable() else 0.0
-
-    def all(self) -> Lines:
-        """All lines below the header."""
-        return [line for block in self.blocks(LONGEST_LINE) for line in block]
+        return min(self._file.buffer.tell() / size, 1.0) if size else 0.0
 
     def blocks(self, rows: int) -> Iterator[Lines]:
         """The lines below the header, up to ``rows`` at once, from the first one at every call."""
-        lines, self._first = self._first, iter(())
-        if self._read_once:
-            lines = self._cells()
-            next(lines)
-        self._read_once = True
-        count = 0
+        lines, count = islice(self._cells(), 1, None), 0
         while block := list(islice(lines, rows)):
             count += len(block)
             yield block
@@ -136,23 +126,11 @@ class CsvLines:
             raise MeasurementError.of(what, fix="copy it to another disk first") from error
 
     def _texts(self) -> Iterator[str]:
-        """The lines as text; the first time a pipe is read, they are copied."""
+        """The lines of the file as text, from the first one if it can be read again."""
         if self._file.seekable():
             self._file.seek(0)
-            yield from self._bounded(self._file)
-        elif self._copy is None:
-            copy = tempfile.TemporaryFile("w+", encoding="utf-8", newline="")  # noqa: SIM115  # closed with the file
-            self._copy = self._stack.enter_context(copy)
-            for text in self._bounded(self._file):
-                self._copy.write(text)
-                yield text
-        else:
-            self._copy.seek(0)
-            yield from self._copy
-
-    def _bounded(self, file: TextIO) -> Iterator[str]:
         number = 0
-        while text := file.readline(LONGEST_LINE):
+        while text := self._file.readline(LONGEST_LINE):
             number += 1
             if len(text) == LONGEST_LINE:
                 what = f"file '{self.path}', line {number} has more than {LONGEST_LINE} characters"
@@ -164,56 +142,28 @@ _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 _EMPTY = re.compile(r"|nan|n/?a|null|none", re.IGNORECASE)
 HIDDEN = "all cells of a hidden marker or frame are empty, and every line shows some"
-Hideable = tuple[Sequence[int], Sequence[int]]
-"""Places of a marker's, or frame's, values among the wanted columns, and of its standard deviations."""
+
+
+class Hideable(NamedTuple):
+    """Columns that lines may leave empty together: places of values and of deviations among all; what they show."""
+
+    values: Sequence[int]
+    deviations: Sequence[int]
+    word: str
+
+
+class Block(NamedTuple):
+    """Lines of a file: numbers (B, c), NaN where hidden, texts by the name of their column, and the lines' numbers."""
+
+    numbers: Tensor
+    texts: dict[str, list[str]]
+    lines: list[int]
+
+
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
-
-
-def number_blocks(
-    file: CsvLines,
-    wanted: Sequence[str],
-    decimal: str,
-    rows: int,
-    hideable: Sequence[Hideable] = (),
-    *,
-    all_hidden: bool = False,
-) -> Iterator[tuple[Tensor, list[int]]]:
-    """Read some columns of a CSV file in blocks of rows.
-
-    Args:
-        file: the file, with one header line.
-        wanted: names of c columns.
-        decimal: ``"."`` or ``","``.
-        rows: most rows of a block.
-        hideable: the columns of markers that rows may hide: not all of them in one row, unless ``all_hidden``.
-
-    Yields:
-        (B, c) finite numbers as written in the file, NaN for hidden markers, and the line number of every row; nothing
-        more from the first block with a mistake on.
-
-    Raises:
-        MeasurementError: anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the whole
-            file first.
-    """
-    columns = _find_columns(file.path, file.header, wanted, file.sep)
-    mistakes = _Mistakes(file.path, wanted, decimal, markers=len(hideable))
-    for lines in file.blocks(rows):
-        whole = mistakes.without_ragged(lines, len(file.header))
-        cells = [[cells[column] for column in columns] for _, cells in whole]
-        numbers, hidden = _parse(cells, decimal), []
-        if numbers is None and hideable:
-            hidden = _fill_hidden(cells, hideable, all_hidden=all_hidden)
-            numbers = _parse(cells, decimal)
-        if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
-            mistakes.add([line for line, _ in whole], cells)
-        elif not mistakes:
-            if hidden:
-                numbers[tuple(zip(*hidden, strict=True))] = math.nan
-            yield numbers, [line for line, _ in lines]
-    mistakes.raise_first()
 
 
 def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
@@ -223,83 +173,11 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         MeasurementError: a file that cannot be read or has no rows, or lines of different lengths.
     """
     with CsvLines(path, sep) as file:
-        lines = file.all()
-        mistakes = _Mistakes(path, (), ".")
+        lines = [line for block in file.blocks(LONGEST_LINE) for line in block]
+        mistakes = Mistakes(path, (), ".")
         mistakes.without_ragged(lines, len(file.header))
         mistakes.raise_first()
         return file.header, lines
-
-
-@dataclass(frozen=True)
-class TextCells:
-    """The cells of a CSV file as text, which are read when they are first asked for.
-
-    Args:
-        path, sep: the file and its separator.
-    """
-
-    path: Path
-    sep: str
-
-    @cached_property
-    def _read(self) -> tuple[list[str], dict[int, list[str]]]:
-        header, rows = read_cells(self.path, self.sep)
-        return [name.strip() for name in header], dict(rows)
-
-    @property
-    def header(self) -> list[str]:
-        """Names of the columns."""
-        return self._read[0]
-
-    def texts(
-        self,
-        column: str,
-        lines: Sequence[int],
-        *,
-        empty: bool = False,
-        expected: str = "a name",
-        fix: str = "fill it in",
-    ) -> list[str]:
-        """The cells of one column in these lines, as text without blanks around it; "nan" is an empty cell.
-
-        Args:
-            column: its name. lines: numbers of the lines.
-            empty: whether cells may be empty. expected: what they hold. fix: what to do about an empty one.
-
-        Raises:
-            MeasurementError: no such column, several, or an empty cell unless ``empty``.
-        """
-        names, cells = self._read
-        if names.count(column) != 1:
-            what, got = f"file '{self.path}', column '{column}'", f"{names.count(column)} of {few(names)}"
-            fix = "name a column of the table"
-            raise MeasurementError.of(what, expected="one column of this name", got=got, fix=fix)
-        place = names.index(column)
-        texts = [cells[line][place].strip() for line in lines]
-        texts = ["" if text.lower() == "nan" else text for text in texts]  # as programs write what is missing
-        if "" in texts and not empty:
-            bad = BadCells()
-            for line, text in zip(lines, texts, strict=True):
-                if not text:
-                    bad.add(line, column, text)
-            raise bad.error(self.path, expected, fix)
-        return texts
-
-    def numbers(self, column: str, lines: Sequence[int], decimal: str, fix: str, *, empty: bool = False) -> Tensor:
-        """(N,) the cells of one column as numbers in the unit of the file, NaN for empty ones if they may be.
-
-        Raises:
-            MeasurementError: as :meth:`texts`; a cell that is no finite number.
-        """
-        found = []
-        for line, text in zip(lines, self.texts(column, lines, empty=empty, expected="a number", fix=fix), strict=True):
-            value = number(text, decimal) if text else None
-            if text and (value is None or not abs(value) < LARGEST_NUMBER):
-                what = f"file '{self.path}', line {line}, column '{column}'"
-                fix = "repair or remove this line; pass `decimal` if the numbers have another decimal mark"
-                raise MeasurementError.of(what, expected="a number", got=shown(repr(text)), fix=fix)
-            found.append(math.nan if value is None else value)
-        return torch.tensor(found, dtype=torch.float64, device=HOST)
 
 
 def repeated(names: Sequence[str]) -> list[str]:
@@ -335,13 +213,12 @@ class BadCells:
         return MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
 
-class _Mistakes:
+class Mistakes:
     """Faults in the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
 
     def __init__(self, path: Path, wanted: Sequence[str], decimal: str, markers: int = 0) -> None:
         self.path, self.wanted, self.decimal, self.markers = path, wanted, decimal, markers
-        self.ragged: list[int] = []
-        self.expected = self.got = 0
+        self.ragged: list[tuple[int, int]] = []
         self.unreadable, self.missing = BadCells(), BadCells()
 
     def __bool__(self) -> bool:
@@ -349,12 +226,9 @@ class _Mistakes:
 
     def without_ragged(self, lines: Lines, expected: int) -> Lines:
         """The lines that have the expected number of cells."""
-        whole = [(line, cells) for line, cells in lines if len(cells) == expected]
-        if len(whole) < len(lines):
-            others = [(line, len(cells)) for line, cells in lines if len(cells) != expected]
-            self.expected, self.got = expected, self.got or others[0][1]
-            self.ragged += [line for line, _ in others]
-        return whole
+        self.expected = expected
+        self.ragged += [(line, len(cells)) for line, cells in lines if len(cells) != expected]
+        return [(line, cells) for line, cells in lines if len(cells) == expected]
 
     def add(self, lines: Sequence[int], rows: Sequence[Sequence[str]]) -> None:
         """Find the cells that are no finite numbers in the wanted columns of some lines."""
@@ -369,10 +243,10 @@ class _Mistakes:
     def raise_first(self) -> None:
         """Raise MeasurementError if anything is wrong."""
         if self.ragged:
-            what = f"file '{self.path}', line {few(self.ragged)}"
+            what = f"file '{self.path}', line {few([line for line, _ in self.ragged])}"
             fix = "repair these lines (a cell that holds the separator must be quoted)"
-            expected = f"{self.expected} cells as in the header"
-            raise MeasurementError.of(what, expected=expected, got=self.got, fix=fix)
+            expected, got = f"{self.expected} cells as in the header", self.ragged[0][1]
+            raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
         if self.unreadable.first:
             fix = _number_hint(self.unreadable.first[2], self.decimal)
             raise self.unreadable.error(self.path, "a number", fix)
@@ -383,7 +257,7 @@ class _Mistakes:
             raise self.missing.error(self.path, expected, f"remove or repair these lines{hint}")
 
 
-def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
+def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
     """Return the position of every wanted column in the header."""
     missing = [name for name in wanted if name not in header]
     if missing and header[0].startswith("#"):
@@ -437,22 +311,22 @@ def _bare(name: str) -> str:
     return lowered.replace("joint", "").replace("_", "") or lowered
 
 
-def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:
+def fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:
     """Write zeros into the cells of hidden markers, in place, and return their places (row, column)."""
     filled = []
     for number_of_row, cells in enumerate(rows):
-        hidden = [all(_EMPTY.fullmatch(cells[k]) for k in places) for places, _ in hideable]
+        hidden = [all(_EMPTY.fullmatch(cells[k]) for k in own.values) for own in hideable]
         if all(hidden) and not all_hidden:
             continue  # no marker at all: a mistake
-        for (places, deviations), gone in zip(hideable, hidden, strict=True):
-            for column in (*places, *deviations) if gone else ():
-                if column in places or _EMPTY.fullmatch(cells[column]):
+        for own, gone in zip(hideable, hidden, strict=True):
+            for column in (*own.values, *own.deviations) if gone else ():
+                if column in own.values or _EMPTY.fullmatch(cells[column]):
                     cells[column] = "0"
                     filled.append((number_of_row, column))
     return filled
 
 
-def _parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
+def parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
     """The numbers of cells, (B, c); None if some are none, or look like none."""
     if not rows:
         return torch.empty(0, 0, dtype=torch.float64, device=HOST)

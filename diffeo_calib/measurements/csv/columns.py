@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -12,8 +12,16 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
-from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
+from diffeo_calib.measurements.csv.cells import Hideable, repeated
+from diffeo_calib.measurements.table_format import (
+    UNITS_PER_METRE,
+    Names,
+    TableFormat,
+    by_frame,
+    check_choice,
+    column_names,
+    flat_names,
+)
 from diffeo_calib.robots.joint import KINDS
 
 
@@ -32,26 +40,59 @@ class ChainLike(Protocol):
         ...
 
 
-class Values(NamedTuple):
-    """Rows of a table in SI, except for the rotations, whose k numbers each are as in the file."""
+Values = dict[Any, Tensor]
+"""Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`; rotations are as in the file."""
 
-    q: Tensor  # (N, n) rad or m
-    points: Tensor  # (N, P, 3) m
-    rotations: Tensor  # (N, T k) of T frames
-    std: Tensor | None  # (N, P, 3) m
-    rotation_std: Tensor | None  # (N, T, 3) rad
-    payload: Tensor | None  # (N,) in the unit of the file
-    time: Tensor | None = None  # (N,) in the unit of the file
-    temperature: Tensor | None = None  # (N,) in the unit of the file
 
-    def beside(self, rows: Any) -> Any:
-        """Rows with what the table tells of them besides joints and measured values."""
-        return rows.with_payload(self.payload).with_covariates(time=self.time, temperature=self.temperature)
+class Check(NamedTuple):
+    """What numbers are expected to be; whether they may be zero; what to do about others."""
+
+    expected: str
+    zero: bool = False
+    fix: str = "repair these lines, or leave this column out"
+
+
+MASS = Check("a mass of 0 or more", zero=True)
+DEVIATION = Check("a positive standard deviation")
+
+
+class Group(NamedTuple):
+    """Columns of numbers of one quantity.
+
+    Args:
+        names: of the columns. unit: in the file: m, mm, rad, deg, or how many of it are one in SI; None without.
+        check: what the numbers are expected to be.
+    """
+
+    names: tuple[str, ...]
+    unit: str | float | None = None
+    check: Check | None = None
+
+    def to_si(self, values: Tensor) -> Tensor:
+        """Numbers in the unit of the file -> rad, m, or as they are."""
+        return values.deg2rad() if self.unit == "deg" else values / self._per_si
+
+    def from_si(self, values: Tensor) -> Tensor:
+        """The inverse of :meth:`to_si`, on the host, one row for each of the values (N, ...)."""
+        rows = values.cpu().flatten(1) if values.ndim > 1 else values.cpu()[:, None]
+        return rows.rad2deg() if self.unit == "deg" else rows * self._per_si
+
+    @property
+    def _per_si(self) -> float:
+        return self.unit if isinstance(self.unit, float) else UNITS_PER_METRE.get(self.unit or "", 1.0)
+
+
+class Reported(NamedTuple):
+    """Columns of what devices reported: the numbers, their known deviations, and what a line with them holds."""
+
+    values: Group
+    std: Group
+    word: str
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns in this order: joints, positions, rotation, covariates, payload, deviations.
+    """The wanted columns of numbers: joints, positions, rotation, covariates, payload, deviations, readings.
 
     Args:
         table: units, and the convention of the rotation.
@@ -61,10 +102,9 @@ class Columns:
         rotation: names of the columns of the rotations, as many for each of the triples.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
         rotation_std: names of standard deviations of rotations: one, one per frame, or three per frame.
-        payload: name of the column of masses, if there is one.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
-        covariates: names of the columns with which something may drift.
-        all_hidden: whether rows may show no marker, because their ball rested in a socket.
+        readings: what devices reported.
+        all_hidden: whether rows may show no marker, because they hold something else.
     """
 
     table: TableFormat
@@ -75,9 +115,8 @@ class Columns:
     std: tuple[str, ...] = ()
     rotation_std: tuple[str, ...] = ()
     kinds_known: bool = True
-    payload: tuple[str, ...] = ()
+    readings: tuple[Reported, ...] = ()
     all_hidden: bool = False
-    covariates: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -86,6 +125,9 @@ class Columns:
         joints: Sequence[str] | ChainLike,
         kinds: Sequence[str] | None,
         triples: list[tuple[str, ...]],
+        readings: Sequence[Reported] = (),
+        *,
+        all_hidden: bool = False,
     ) -> Columns:
         """Check names and kinds of columns.
 
@@ -100,46 +142,58 @@ class Columns:
         rotation, rotation_std = flat_names(table.rotation), flat_names(table.rotation_std)
         _check_frames(table, len(triples))
         std = _std_names(table.std, len(triples))
-        payload = (
-            () if table.payload is None else column_names("payload", [table.payload], "the name of a column", (1,))
-        )
-        columns = cls(table, names, prismatic, triples, rotation, std, rotation_std, kinds_known, payload)
-        columns = replace(columns, covariates=tuple(table.covariates.values()))
+        if table.payload is not None:
+            column_names("payload", [table.payload], "the name of a column", (1,))
+        own = table, names, prismatic, triples, rotation, std, rotation_std
+        columns = cls(*own, kinds_known, tuple(readings), all_hidden)
         twice = repeated(columns.names)
         if twice:
-            plain = not rotation and not std and not payload and not columns.covariates
+            plain = len(columns.names) == len(names) + 3 * len(triples)
             what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
             fix = "name every column once"
-            fix += ", and one that holds the deviations of all axes alone" * bool({*twice} & {*columns.deviations})
+            fix += ", and one that holds the deviations of all axes alone" * bool({*twice} & {*std, *rotation_std})
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
         return columns
 
     @property
+    def groups(self) -> dict[Any, Group]:
+        """All columns by what they hold, joints first; those of readings by themselves."""
+        table, positions = self.table, tuple(name for triple in self.triples for name in triple)
+        found = {"q": Group(self.joints), "points": Group(positions, table.length), "rotations": Group(self.rotation)}
+        found |= {name: Group((column,)) for name, column in table.covariates.items()}
+        found |= {} if table.payload is None else {"payload": Group((table.payload.strip(),), None, MASS)}
+        found["std"] = Group(self.std, table.length, DEVIATION)
+        found["rotation_std"] = Group(self.rotation_std, self.rotation_unit, DEVIATION)
+        own = [group for one in self.readings for group in (one.values, one.std)]
+        return {key: group for key, group in (*found.items(), *zip(own, own, strict=True)) if group.names}
+
+    @property
     def names(self) -> list[str]:
         """All columns, joints first."""
-        return [name for group in self._groups for name in group]
+        return [name for group in self.groups.values() for name in group.names]
 
     @property
-    def deviations(self) -> tuple[str, ...]:
-        """All columns of standard deviations: the last ones."""
-        return self.std + self.rotation_std
+    def hideable(self) -> list[Hideable]:
+        """The columns of every marker, frame and reading that lines may leave empty."""
+        count, place = len(self.triples), {name: number for number, name in enumerate(self.names)}
 
-    @property
-    def hideable(self) -> list[tuple[list[int], list[int]]]:
-        """Places of a marker's or frame's values among all columns, and of its deviations; none that is always seen."""
-        count = len(self.triples)
-        if count < 2 - self.all_hidden:
-            return []
-        place = {name: number for number, name in enumerate(self.names)}
+        def places(*names: str) -> list[int]:
+            return [place[name] for name in names]
 
         def own(names: Sequence[str], k: int) -> list[int]:
             each = len(names) // count  # of deviations 0, 1 or 3; one for all markers belongs to none
-            return [place[name] for name in names[k * each : (k + 1) * each]]
+            return places(*names[k * each : (k + 1) * each])
 
-        return [
-            ([place[name] for name in triple] + own(self.rotation, k), own(self.std, k) + own(self.rotation_std, k))
+        said = f"shows this {'frame' if self.rotation else 'marker'}"
+        markers = [
+            Hideable(places(*triple) + own(self.rotation, k), own(self.std, k) + own(self.rotation_std, k), said)
             for k, triple in enumerate(self.triples)
         ]
+        if not self.all_hidden:
+            return markers if count > 1 else []
+        pairs = [(one.values.names or one.std.names, one.values.names and one.std.names, one) for one in self.readings]
+        shown = [Hideable(places(*names), places(*std), f"holds {one.word}") for names, std, one in pairs if names]
+        return markers + shown
 
     @property
     def rotation_unit(self) -> str:
@@ -147,60 +201,59 @@ class Columns:
         return self.table.rotation_angle or "rad"
 
     def to_si(self, raw: Tensor) -> Values:
-        """Convert rows (N, c) in the file's units, columns in the order of ``names``."""
-        per_metre, count = self.table.per_metre, len(self.triples)
-        q, points, rotations, drifting, payload, std, rotation_std = self._parts(raw)
-        joints = torch.where(
-            self.prismatic, q / self.table.joints_per_metre, q.deg2rad() if self.table.angle == "deg" else q
-        )
-        known, rotations_known = None, None
-        if self.std:
-            std = std.reshape(len(raw), -1, 3 if len(self.std) == 3 * count else 1)  # per coordinate or per marker
-            known = (std / per_metre).expand(len(raw), count, 3)
-        if self.rotation_std:
-            rotations_known = rotation_std.deg2rad() if self.rotation_unit == "deg" else rotation_std
-            each = 3 if len(self.rotation_std) == 3 * count else 1  # per axis or per frame
-            rotations_known = rotations_known.reshape(len(raw), -1, each).expand(len(raw), count, 3)
-        places, masses = (points / per_metre).reshape(len(raw), -1, 3), payload[:, 0] if self.payload else None
-        covariates = dict(zip(self.table.covariates, drifting.T, strict=True))
-        return Values(joints, places, rotations, known, rotations_known, masses, **covariates)
+        """Convert rows (N, c) in the file's units, columns in the order of ``names``.
+
+        Returns:
+            q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), payload and covariates (N,), others
+            (N, c).
+        """
+        found, count = self._parts(raw), len(self.triples)
+        values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
+        q, table = found["q"], self.table
+        turns = q.deg2rad() if table.angle == "deg" else q
+        values["q"] = torch.where(self.prismatic, q / table.joints_per_metre, turns)
+        for name in {"points", "std", "rotation_std"} & {*values}:
+            each = 3 if values[name].shape[1] == 3 * count else 1  # or one per marker, or for all
+            values[name] = values[name].reshape(len(raw), -1, each).expand(len(raw), count, 3)
+        return values | {name: values[name][:, 0] for name in {"payload", *table.covariates} & {*values}}
+
+    def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
+        """The cells of columns by name, of values in SI by what they are."""
+        groups, rows = self.groups, {name: own for name, own in values.items() if own is not None}
+        found = {"q": self.joints_from_si(rows["q"])}
+        found |= {name: groups[name].from_si(own) for name, own in rows.items() if name != "q"}
+        pairs = [zip(groups[name].names, own.T.tolist(), strict=True) for name, own in found.items()]
+        return {column: cells for pair in pairs for column, cells in pair}
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as rows in the file's units."""
         q, table = q.cpu(), self.table
         return torch.where(self.prismatic, q * table.joints_per_metre, q.rad2deg() if table.angle == "deg" else q)
 
-    def lengths_from_si(self, values: Tensor) -> Tensor:
-        """Lengths (N, ...) in m as rows in the file's unit."""
-        return values.cpu().flatten(1) * self.table.per_metre
-
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
-        q, points, rotations, *_ = self._parts(raw)
-        angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
-        sentences = unlikely_units("angles", angle, self.table.angle, "angle", kinds_known=known)
-        slides = _largest(q[:, self.prismatic])
-        sentences += unlikely_units("prismatic joints", slides, self.table.joint_unit, "joint_length")
-        sentences += unlikely_units("positions", _largest(points), self.table.length, "length")
+        found, table = self._parts(raw), self.table
+        angle, known = _largest(found["q"][:, ~self.prismatic]), self.kinds_known
+        sentences = unlikely_units("angles", angle, table.angle, "angle", kinds_known=known)
+        slides = _largest(found["q"][:, self.prismatic])
+        sentences += unlikely_units("prismatic joints", slides, table.joint_unit, "joint_length")
+        if self.triples:
+            sentences += unlikely_units("positions", _largest(found["points"]), table.length, "length")
         if self.rotation and len(self.rotation) == 3 * len(self.triples):
-            sentences += unlikely_units("rotations", _largest(rotations), self.rotation_unit, "rotation_angle")
+            sentences += unlikely_units("rotations", _largest(found["rotations"]), self.rotation_unit, "rotation_angle")
         return sentences
 
-    def _parts(self, raw: Tensor) -> tuple[Tensor, ...]:
-        """Split rows (N, c) into the groups of columns."""
-        return raw.split([len(group) for group in self._groups], dim=1)
-
-    @property
-    def _groups(self) -> tuple[Sequence[str], ...]:
-        positions = [name for triple in self.triples for name in triple]
-        return self.joints, positions, self.rotation, self.covariates, self.payload, self.std, self.rotation_std
+    def _parts(self, raw: Tensor) -> Values:
+        """The columns of each group of rows (N, c)."""
+        groups = self.groups
+        return dict(zip(groups, raw.split([len(group.names) for group in groups.values()], dim=1), strict=True))
 
 
 def _check_frames(table: TableFormat, positions: int) -> None:
     """Raise MeasurementError unless every rotation has its position, and every deviation its rotation."""
     deviations = None if len(flat_names(table.rotation_std)) == 1 else table.rotation_std  # one for all frames
     for name, names in (("rotation", table.rotation), ("rotation_std", deviations)):
-        count = 0 if not names else 1 if isinstance(names[0], str) else len(names)
+        count = len(names or ())
         if count not in (0, positions):
             got = f"{positions} triples and {count} {'list' if count == 1 else 'lists'} of columns in `{name}`"
             fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
@@ -209,17 +262,8 @@ def _check_frames(table: TableFormat, positions: int) -> None:
 
 
 def position_triples(position: Names) -> list[tuple[str, ...]]:
-    """Return one (x, y, z) triple of column names per marker.
-
-    Raises:
-        MeasurementError: not three names per marker.
-    """
-    groups = [position] if all(isinstance(name, str) for name in position) else position
-    triples = [() if isinstance(group, str) else tuple(group) for group in groups]
-    if not triples or not all(len(t) == 3 and all(isinstance(name, str) for name in t) for t in triples):
-        expected, fix = "three names of columns", "pass ('x', 'y', 'z'), or one such triple per marker"
-        raise MeasurementError.of("`position`", expected=expected, got=as_written(position), fix=fix)
-    return [tuple(str(name).strip() for name in triple) for triple in triples]
+    """Return one (x, y, z) triple of column names per marker; MeasurementError without three names for each."""
+    return list(by_frame("position", position, "three names of columns for each marker", 3))
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

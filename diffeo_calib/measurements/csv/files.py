@@ -20,11 +20,10 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.cells import TextCells
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, position_triples
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns
 from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
-from diffeo_calib.measurements.csv.writing import write_measurements
+from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings
@@ -55,15 +54,15 @@ def read_observations(
         else :class:`Observations`. Rows are in the order of the file.
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    file, sensors = Path(path), columns.sensors
-    numbers = numeric_columns(columns, table)
-    with TableFile(file, numbers) as whole:
-        values, lines = whole.read()
-    rows = FileRows(TextCells(file, table.sep), numbers, values, lines, alone=len(sensors) == 1)
+    file, sensors, numbers = Path(path), columns.sensors, columns.numeric(table)
+    with TableFile(file, numbers, columns.texts) as whole:
+        rows = FileRows(file, numbers, *whole.read(), alone=len(sensors) == 1)
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
-        tables.append(own.values.beside(sensor.table(here)).with_line_numbers(own.lines))
+        found = sensor.table(here).with_line_numbers(own.lines)
+        time, temperature = own.values.get("time"), own.values.get("temperature")
+        tables.append(found.with_payload(own.values.get("payload")).with_covariates(time=time, temperature=temperature))
     data = tables[0] if rows.alone else joined_tables(tables)
     data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
     sha256 = file_sha256(file)
@@ -74,50 +73,21 @@ def read_observations(
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
 
-def numeric_columns(columns: TableColumns, table: TableFormat) -> Columns:
-    """The joints, positions and payloads of a table.
-
-    Raises:
-        MeasurementError: no kind of rows, or options for something that is not measured.
-    """
-    _check_options(columns, table)
-    if columns.position is None:
-        return Columns.of(table.joints_only(), columns.joints, columns.kinds, [])
-    triples = position_triples(columns.position)
-    found = Columns.of(table.for_reading(), columns.joints, columns.kinds, triples)
-    return replace(found, all_hidden=len(columns.sensors) > 1)
-
-
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
     """Each kind and the lines that hold it; MeasurementError for lines without any."""
     if rows.alone:
         return [(sensors[0], rows)]
     filled = [sensor.filled(rows) for sensor in sensors]
+    for sensor in (sensor for sensor, here in zip(sensors, filled, strict=True) if not bool(here.any())):
+        what = f"file '{rows.path}': no line holds {sensor.word}"
+        raise MeasurementError.of(what, expected="some rows of this kind", fix="leave its columns out")
     empty = [rows.lines[row] for row in (~torch.stack(filled).any(0)).nonzero()[:, 0].tolist()]
     if empty:
-        what, words = f"file '{rows.cells.path}', line {few(empty)}", [sensor.word for sensor in sensors]
+        what, words = f"file '{rows.path}', line {few(empty)}", [sensor.word for sensor in sensors]
         fix, got = "fill in one of them, or remove the line", "neither" if len(words) == 2 else "none of them"
         expected = " or ".join([", ".join(words[:-1]), words[-1]])
         raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
     return [(sensor, rows.of(here)) for sensor, here in zip(sensors, filled, strict=True)]
-
-
-def _check_options(columns: TableColumns, table: TableFormat) -> None:
-    if not columns.sensors:
-        fix = "name the columns of the marker, or those of `socket`"
-        raise MeasurementError.of("`position` is missing", fix=fix)
-    if table.remounted and columns.session is None:
-        raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
-    if columns.position is not None:
-        return
-    given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
-    given |= {"camera_on_tool": table.camera_on_tool or None, "remounted": table.remounted or None}
-    given |= {"session": columns.session}
-    names = [f"`{name}`" for name, value in given.items() if value is not None]
-    if names:
-        beside = "socket" if columns.sockets is not None else "readings"
-        fix = "leave it out: no position was measured; sockets of another set-up are other places"
-        raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)
 
 
 def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: bool) -> Rows:
@@ -134,17 +104,6 @@ def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: 
         text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
         warn_user(f"{text} (line {few([at[row] for row in dropped])}); pass duplicates='keep' to keep them.")
     return data.rows(np.setdiff1d(np.arange(count), dropped))
-
-
-__all__ = [
-    "open_joints",
-    "read_joints",
-    "read_measurements",
-    "read_observations",
-    "read_readings",
-    "read_table",
-    "write_measurements",
-]
 
 
 @outside_inference_mode
@@ -260,21 +219,6 @@ def _read(
     return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
 
 
-def read_table(
-    path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
-    position: Names,
-    table: TableFormat,
-    *,
-    duplicates: str = "error",
-    kinds: Sequence[str] | None = None,
-    session: str | None = None,
-) -> Measurements:
-    """The same as :func:`read_measurements` for a format that is given as one object."""
-    columns = TableColumns(joints, position, session=session, kinds=kinds)
-    return read_observations(path, columns, table, duplicates=duplicates)
-
-
 @outside_inference_mode
 def read_readings(
     path: str | PathLike[str],
@@ -352,7 +296,7 @@ def read_joints(
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
     with open_joints(path, joints, table, kinds=kinds) as file:
-        return file.read()[0].q
+        return file.read()[0]["q"]
 
 
 def open_joints(

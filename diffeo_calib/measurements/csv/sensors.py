@@ -2,86 +2,122 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from math import isnan
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
-from diffeo_calib.measurements.checks import unlikely_units
-from diffeo_calib.measurements.csv.cells import BadCells, TextCells
-from diffeo_calib.measurements.csv.columns import Columns, Values
-from diffeo_calib.measurements.csv.tables import to_measurements
+from diffeo_calib.measurements.checks import of_measurements, unlikely_units
+from diffeo_calib.measurements.csv.cells import BadCells
+from diffeo_calib.measurements.csv.columns import (
+    DEVIATION,
+    Check,
+    Columns,
+    Group,
+    Reported,
+    Values,
+    position_triples,
+)
+from diffeo_calib.measurements.pose_frames import (
+    inverse_poses,
+    of_frames,
+    transforms_of_frames,
+    visible_rotation_numbers,
+)
+from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
+LENGTH = Check(
+    "a distance above 0", fix="repair or remove these lines; distances with an unknown zero are displacements"
+)
 
 
 class FileRows(NamedTuple):
     """Some lines of a file.
 
     Args:
-        cells: its cells as text. columns: its columns of numbers. values: these in SI. lines: numbers of the lines.
+        path: the file. columns: its columns of numbers. values: these in SI. texts: its columns of texts.
+        lines: their numbers in the file.
         alone: whether all lines of the file hold rows of one kind, so that no cell may be empty.
     """
 
-    cells: TextCells
+    path: Path
     columns: Columns
     values: Values
-    lines: list[int]
+    texts: Mapping[str, Sequence[str]]
+    lines: Sequence[int]
     alone: bool
 
-    def of(self, chosen: Tensor) -> FileRows:
-        """The lines that a mask (N,) chooses."""
-        values = Values(*(None if value is None else value[chosen] for value in self.values))  # pyright: ignore
-        return self._replace(values=values, lines=[self.lines[row] for row in chosen.nonzero()[:, 0].tolist()])
+    def of(self, rows: Tensor) -> FileRows:
+        """The lines with these numbers (M,), or those that a mask (N,) chooses."""
+        chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
+        values = {name: own[rows] for name, own in self.values.items()}
+        texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
+        return self._replace(values=values, texts=texts, lines=[self.lines[row] for row in chosen])
 
-    def names(self, column: str | None, expected: str, fix: str = "fill it in") -> list[str] | None:
+    def filled(self, column: str) -> Tensor:
+        """(N,) boolean, which lines have a text in a column."""
+        return torch.tensor([bool(text) for text in self.texts[column]], dtype=torch.bool, device=HOST)
+
+    def named(self, column: str, expected: str, fix: str = "fill it in") -> Sequence[str]:
+        """The texts of a column; MeasurementError for empty ones, which says what is expected and what to do."""
+        bad = BadCells()
+        for line in (line for line, text in zip(self.lines, self.texts[column], strict=True) if not text):
+            bad.add(line, column, "")
+        if bad.count:
+            raise bad.error(self.path, expected, fix)
+        return self.texts[column]
+
+    def devices(self, column: str | None, expected: str, fix: str = "fill it in") -> Sequence[str] | None:
         """Names of devices or set-ups; None without a column, or where other kinds alone fill it."""
-        if column is None or not (self.alone or any(self.cells.texts(column, self.lines, empty=True))):
+        if column is None or not (self.alone or any(self.texts[column])):
             return None
-        return self.cells.texts(column, self.lines, expected=expected, fix=fix)
+        return self.named(column, expected, fix)
 
 
-class SensorColumns(Protocol):
-    """The columns of rows of one kind."""
+Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
+"""Rows as lines of a file: numbers in SI by what they are, texts by their column, and the row (M,) of each line."""
 
-    @property
-    def word(self) -> str:
-        """Name of the contents of a row, such as "a position"."""
-        ...
+
+class SensorColumns:
+    """The columns of rows of one kind; ``word``: name of the contents of a row, such as "a position"."""
+
+    word: ClassVar[str]
+    texts: Mapping[str, bool]
+    """Columns of texts, and whether a table must have them."""
+
+    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+        """The columns of numbers beside joints, positions, payloads and covariates."""
+        return ()
 
     def filled(self, rows: FileRows) -> Tensor:
-        """(N,) boolean, which lines hold such a row; MeasurementError for lines that fill some of its cells."""
-        ...
-
-    def table(self, rows: FileRows) -> Any:
-        """The rows of these lines, all of which hold one."""
-        ...
+        """(N,) boolean, which lines hold such a row."""
+        raise NotImplementedError
 
     def own_lines(self, rows: FileRows) -> FileRows:
         """The line of every row."""
-        ...
-
-
-class OneLineEach:
-    """Rows of one line."""
-
-    def own_lines(self, rows: FileRows) -> FileRows:
-        """See :class:`SensorColumns`."""
         return rows
+
+    def table(self, rows: FileRows) -> Any:
+        """The rows of these lines, all of which hold one."""
+        raise NotImplementedError
+
+    def written(self, part: Any, table: TableFormat) -> Written:
+        """The inverse of :meth:`table`; joints, payloads and covariates are those of the rows."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class PositionColumns(OneLineEach):
+class PositionColumns(SensorColumns):
     """Measured positions or poses, whose columns are those of a table's :class:`Columns`.
 
     Args:
@@ -90,20 +126,68 @@ class PositionColumns(OneLineEach):
 
     session: str | None = None
     on: Sequence[str] | None = None
-    word: str = field(default="a position", init=False)
+    word = "a position"
+
+    @property
+    def texts(self) -> Mapping[str, bool]:
+        """See :class:`SensorColumns`."""
+        return {} if self.session is None else {self.session: True}
 
     def filled(self, rows: FileRows) -> Tensor:
         """See :class:`SensorColumns`."""
-        return ~rows.values.points.isnan().flatten(1).all(1)
+        return ~rows.values["points"].isnan().flatten(1).all(1)
 
     def table(self, rows: FileRows) -> Measurements:
+        """See :class:`SensorColumns`; MeasurementError for numbers that do not form a rotation."""
+        values, columns, table = rows.values, rows.columns, rows.columns.table
+        std, turns = values.get("std"), values.get("rotation_std")
+        if table.convention is None:
+            data = Measurements(values["q"], values["points"], columns.joints, std=std, doubt=False)
+        else:
+            single = len(columns.triples) == 1
+            data = Measurements.from_poses(
+                values["q"],
+                of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"])),
+                columns.joints,
+                lever=table.lever,
+                position_std=std[:, 0] if single and std is not None else std,
+                rotation_std=turns[:, 0] if single and turns is not None else turns,
+                camera_on_tool=table.camera_on_tool,
+                doubt=False,
+            )
+        return data.with_tips(self.on).with_sessions(rows.devices(self.session, "a name"), remounted=table.remounted)
+
+    def written(self, part: Any, table: TableFormat) -> Written:
         """See :class:`SensorColumns`."""
-        data = to_measurements(rows.cells.path, rows.values, rows.lines, rows.columns).with_tips(self.on)
-        return data.with_sessions(rows.names(self.session, "a name"), remounted=rows.columns.table.remounted)
+        frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
+        values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
+        if frames is not None:
+            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
+            values |= {"rotations": numbers, "rotation_std": part.rotation_std}
+        texts = {} if self.session is None else {self.session: part.device_names}
+        return values, texts, *part.index
+
+
+def _rotations(rows: FileRows, convention: str) -> Tensor:
+    """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
+    columns, lines = rows.columns, rows.lines
+    numbers = rows.values["rotations"].unflatten(1, (len(columns.triples), -1))
+    seen, count = ~numbers.isnan().any(2), numbers.shape[2]
+    shown = seen.nonzero().tolist()
+
+    def place(number: int) -> str:
+        row, frame = shown[number]
+        own = columns.rotation[frame * count : (frame + 1) * count]
+        return f"file '{rows.path}', line {lines[row]}, columns {', '.join(own)}"
+
+    found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
+    with of_measurements():
+        found[seen] = rotation_matrices(numbers[seen], convention, angle=columns.rotation_unit, place=place)
+    return found
 
 
 @dataclass(frozen=True)
-class SocketColumns(OneLineEach):
+class SocketColumns(SensorColumns):
     """How a table names sockets.
 
     Args:
@@ -116,36 +200,36 @@ class SocketColumns(OneLineEach):
     distances: Distances | None = None
     distance_std: float | None = None
     on: str | None = None
-    word: str = field(default="a socket", init=False)
+    word = "a socket"
 
-    def filled(self, rows: FileRows) -> Tensor:
+    @property
+    def texts(self) -> Mapping[str, bool]:
         """See :class:`SensorColumns`."""
-        found = torch.tensor([bool(text) for text in self._texts(rows)], dtype=torch.bool, device=HOST)
-        if not bool(found.any()):
-            what, fix = f"file '{rows.cells.path}': no line names a socket", "leave `socket` out"
-            raise MeasurementError.of(what, expected="some rows in sockets", fix=fix)
-        return found
-
-    def table(self, rows: FileRows) -> Measurements:
-        """See :class:`SensorColumns`."""
-        known = {"distances": self.distances, "distance_std": self.distance_std}
-        data = Measurements.from_sockets(rows.values.q, self._texts(rows), rows.columns.joints, **known, doubt=False)
-        return data.with_tips(None if self.on is None else [self.on])
-
-    def _texts(self, rows: FileRows) -> list[str]:
-        """The socket of each line, such as "front/0"; "" where its cells are empty, if they may be."""
         if not self.names:
             fix = "pass ['place', 'socket']"
             raise MeasurementError.of("`socket`", expected="names of columns", got="none", fix=fix)
+        return dict.fromkeys(self.names, True)
+
+    def filled(self, rows: FileRows) -> Tensor:
+        """See :class:`SensorColumns`."""
+        return torch.stack([rows.filled(name) for name in self.names]).any(0)
+
+    def table(self, rows: FileRows) -> Measurements:
+        """See :class:`SensorColumns`."""
         fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
-        said = {"expected": "the name of a place or socket", "fix": fix, "empty": not rows.alone}
-        cells = list(zip(*(rows.cells.texts(name, rows.lines, **said) for name in self.names), strict=True))
-        _check_whole(rows, self.names, [[bool(text) for text in row] for row in cells], "a name")
-        return [SEPARATOR.join(row) if all(row) else "" for row in cells]
+        parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
+        names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
+        known = {"distances": self.distances, "distance_std": self.distance_std}
+        data = Measurements.from_sockets(rows.values["q"], names, rows.columns.joints, **known, doubt=False)
+        return data.with_tips(None if self.on is None else [self.on])
+
+    def written(self, part: Any, table: TableFormat) -> Written:
+        """See :class:`SensorColumns`."""
+        return {}, {self.names[0]: part.row_sockets}, *part.index
 
 
 @dataclass(frozen=True)
-class ReadingColumns(OneLineEach):
+class ReadingColumns(SensorColumns):
     """How a table holds readings.
 
     Args:
@@ -172,68 +256,58 @@ class ReadingColumns(OneLineEach):
         """See :class:`SensorColumns`."""
         return "an image" if self.kind == "image" else f"a {self.kind}"
 
+    @property
+    def texts(self) -> Mapping[str, bool]:
+        """See :class:`SensorColumns`."""
+        return {} if self.device is None else {self.device: True}
+
+    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+        """See :class:`SensorColumns`."""
+        unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
+        check = LENGTH if self.kind == "distance" and not self.offset_std else None
+        names = self.values if isinstance(self.values, tuple) else ()
+        return (Reported(Group(names, unit, check), Group(self.std, unit, DEVIATION), self.word),)
+
     def filled(self, rows: FileRows) -> Tensor:
         """See :class:`SensorColumns`."""
         if isinstance(self.values, tuple):
-            there = ~self._read(rows, self.values).isnan()
-            _check_whole(rows, self.values, there.tolist(), "a number")
-            found = there.all(1)
-        elif self.device is None:
+            return ~rows.values[self.reported(rows.columns.table)[0].values].isnan().any(1)
+        if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
-        else:
-            names = rows.cells.texts(self.device, rows.lines, empty=True)
-            found = torch.tensor([bool(name) for name in names], dtype=torch.bool, device=HOST)
-        if not bool(found.any()):
-            what = f"file '{rows.cells.path}': no line holds {self.word}"
-            raise MeasurementError.of(what, expected="some rows of this kind", fix="leave its columns out")
-        return found
+        return rows.filled(self.device)
 
     def table(self, rows: FileRows) -> Readings:
         """See :class:`SensorColumns`."""
-        table, shape = rows.columns.table, (len(rows.lines), 1)
+        q, joints, table, (own,) = (
+            rows.values["q"],
+            rows.columns.joints,
+            rows.columns.table,
+            self.reported(rows.columns.table),
+        )
         if isinstance(self.values, tuple):
-            seen = self._read(rows, self.values)
-            if self.kind == "distance" and not self.offset_std:
-                fix = "repair or remove these lines; distances with an unknown zero are displacements"
-                _check_positive(rows, self.values, seen, "a distance above 0", fix)
+            seen = rows.values[own.values]
         else:
-            seen = torch.full(shape, self.values, dtype=torch.float64, device=HOST)
-        std = self._read(rows, self.std) if self.std else None
-        if std is not None:
-            _check_positive(rows, self.std, std, "a positive standard deviation", "repair these lines")
-        if self.kind == "distance":
-            for text in unlikely_units("positions", float(seen.abs().max()), table.length, "length"):
-                warn_user(f"file '{rows.cells.path}': {text}".replace("positions", "distances"))
-        devices = rows.names(self.device, "the name of the device of this reading", ONE_READING)
-        data = self._readings(rows, table, devices, seen, std)
+            seen = own.values.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
+        devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
+        std = rows.values[own.std].expand_as(seen) if self.std else None
+        given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
+        if self.kind == "image":
+            data = Readings.images(*given, focal=self.intrinsics[:2], centre=self.intrinsics[2:], **known)
+        elif self.kind == "distance":
+            largest = float(own.values.from_si(seen).abs().max())
+            for text in unlikely_units("positions", largest, table.length, "length"):
+                warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))
+            data = Readings.distances(*given, offset_std=self.offset_std, **known)
+        else:
+            data = Readings.of(self.kind, *given, unit=self.unit, numbers=seen.shape[1], **known)
         return data.with_tips(None if self.on is None else [self.on])
 
-    def _readings(
-        self, rows: FileRows, table: TableFormat, devices: list[str] | None, seen: Tensor, std: Tensor | None
-    ) -> Readings:
-        """The readings (N, r) in the units of the file."""
-        q, joints, known = rows.values.q, rows.columns.joints, {"std": std, "doubt": False}
-        if self.kind == "image":
-            (fx, fy, cx, cy), r = self.intrinsics, seen.shape[1]
-            known["std"] = None if std is None else std.expand(-1, r)
-            return Readings.images(q, seen, devices, joints, focal=(fx, fy), centre=(cx, cy), **known)
-        lengths, known["std"] = seen / table.per_metre, None if std is None else std / table.per_metre
-        if self.kind == "height":
-            return Readings.heights(q, lengths, devices, joints, **known)
-        if self.kind == "distance":
-            return Readings.distances(q, lengths, devices, joints, offset_std=self.offset_std, **known)
-        per_value = table.per_metre if self.unit == MILLIMETRES else self.unit[1]
-        known["std"] = None if std is None else std / per_value
-        own = {"unit": self.unit, "numbers": seen.shape[1], **known}
-        return Readings.of(self.kind, q, seen / per_value, devices, joints, **own)
-
-    def _read(self, rows: FileRows, names: Sequence[str]) -> Tensor:
-        """(N, c) numbers in the unit of the file, NaN where empty."""
-        decimal, empty = rows.columns.table.decimal, not rows.alone
-        return torch.stack(
-            [rows.cells.numbers(name, rows.lines, decimal, ONE_READING, empty=empty) for name in names], 1
-        )
+    def written(self, part: Any, table: TableFormat) -> Written:
+        """See :class:`SensorColumns`."""
+        (own,) = self.reported(table)
+        values = {own.values: part.reported} | ({own.std: part.reported_std} if self.std else {})
+        return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
 @dataclass(frozen=True)
@@ -263,20 +337,38 @@ class TableColumns:
         positions = [] if self.position is None else [PositionColumns(self.session, self.on)]
         return [*positions, *([] if self.sockets is None else [self.sockets]), *self.readings]
 
+    @property
+    def texts(self) -> dict[str, bool]:
+        """The columns of texts, and whether a table must have them."""
+        pairs = [pair for sensor in self.sensors for pair in sensor.texts.items()]
+        return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
 
-def _check_whole(rows: FileRows, names: Sequence[str], there: Sequence[Sequence[bool]], expected: str) -> None:
-    """Raise MeasurementError for a line that fills some of these columns alone."""
-    for line, row in zip(rows.lines, there, strict=True):
-        if any(row) and not all(row):
-            what = f"file '{rows.cells.path}', line {line}, column '{names[list(row).index(False)]}'"
-            raise MeasurementError.of(what, expected=expected, got="an empty cell", fix="fill it in")
+    def numeric(self, table: TableFormat) -> Columns:
+        """The columns of numbers.
 
+        Raises:
+            MeasurementError: no kind of rows, or options for something that is not measured.
+        """
+        self._check_options(table)
+        triples = [] if self.position is None else position_triples(self.position)
+        table = table.joints_only() if self.position is None else table.for_reading()
+        reported = [one for sensor in self.sensors for one in sensor.reported(table)]
+        several = len(self.sensors) > 1
+        return Columns.of(table, self.joints, self.kinds, triples, reported, all_hidden=several)
 
-def _check_positive(rows: FileRows, names: Sequence[str], seen: Tensor, expected: str, fix: str) -> None:
-    """Raise MeasurementError for numbers (N, c) that are not positive, or missing."""
-    bad = BadCells()
-    for row, column in (~(seen > 0.0)).nonzero().tolist():
-        value = float(seen[row, column])
-        bad.add(rows.lines[row], names[int(column)], "" if isnan(value) else f"{value:g}")
-    if bad.count:
-        raise bad.error(Path(rows.cells.path), expected, fix)
+    def _check_options(self, table: TableFormat) -> None:
+        if not self.sensors:
+            fix = "name the columns of the marker, or those of `socket`"
+            raise MeasurementError.of("`position` is missing", fix=fix)
+        if table.remounted and self.session is None:
+            raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
+        if self.position is not None:
+            return
+        given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
+        given |= {"camera_on_tool": table.camera_on_tool or None, "remounted": table.remounted or None}
+        given |= {"session": self.session}
+        names = [f"`{name}`" for name, value in given.items() if value is not None]
+        if names:
+            beside = "socket" if self.sockets is not None else "readings"
+            fix = "leave it out: no position was measured; sockets of another set-up are other places"
+            raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.cells import CsvLines, number, number_blocks, read_cells
+from diffeo_calib.measurements.csv.cells import (
+    LARGEST_NUMBER,
+    BadCells,
+    Block,
+    CsvLines,
+    Mistakes,
+    fill_hidden,
+    find_columns,
+    number,
+    parse,
+    read_cells,
+)
 from diffeo_calib.measurements.csv.columns import Columns, Values
-from diffeo_calib.measurements.pose_frames import of_frames, transforms_of_frames
-from diffeo_calib.measurements.poses import LEVER, rotation_matrices
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.poses import LEVER
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
 
 @dataclass(frozen=True)
@@ -89,13 +97,11 @@ class TableOrigin:
 ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 
-Block = tuple[Tensor, list[int]]
-"""Numbers (B, c) in the units of a file, columns in the order of its format, and the line number of every row."""
 Progress = Callable[[float], object]
 """Called with the fraction of the file that has been read."""
 
 
-class TableFile:
+class TableFile(CsvLines):
     """A CSV file with columns in known units, used as a context.
 
     It can be read as a whole (:meth:`read`), or in two passes for joint values that do not fit in memory: :meth:`check`
@@ -103,149 +109,101 @@ class TableFile:
 
     Args:
         path: the file.
-        columns: which columns it has, and their units.
+        columns: which columns of numbers it has, and their units. texts: columns of texts, "nan" being empty, and
+            whether it must have them.
 
     Attributes:
         rows: number of rows; 0 before the first pass.
     """
 
-    def __init__(self, path: Path, columns: Columns) -> None:
-        self.path, self.columns, self.rows = path, columns, 0
-        self._file = CsvLines(path, columns.table.sep)
+    def __init__(self, path: Path, columns: Columns, texts: Mapping[str, bool] = {}) -> None:  # not changed
+        super().__init__(path, columns.table.sep)
+        self.columns, self.texts, self.rows = columns, texts, 0
 
-    def __enter__(self) -> Self:
-        self._file.__enter__()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
-        self._file.__exit__(kind, value, trace)
-
-    def read(self) -> tuple[Values, list[int]]:
-        """All rows, and the line number of each.
+    def read(self) -> tuple[Values, dict[str, list[str]], list[int]]:
+        """The numbers and the texts of all rows, and the line number of each.
 
         Raises:
-            MeasurementError: any mistake in the file, see :func:`number_blocks`; standard deviations that are not
-                positive, negative payloads.
+            MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
         Warns:
             DiffeoCalibWarning: values that look as if they were in another unit.
         """
         blocks = list(self._checked())
-        numbers = [number for _, lines in blocks for number in lines]
-        return self.columns.to_si(torch.cat([raw for raw, _ in blocks])), numbers
+        texts = {name: [text for block in blocks for text in block.texts[name]] for name in blocks[0].texts}
+        lines = [line for block in blocks for line in block.lines]
+        return self.columns.to_si(torch.cat([block.numbers for block in blocks])), texts, lines
 
     def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
         """Find all mistakes, count the rows, and show blocks to ``each``; errors and warnings as in :meth:`read`."""
-        for raw, _ in self._checked():
+        for block in self._checked():
             if each is not None:
-                each(self.columns.to_si(raw))
+                each(self.columns.to_si(block.numbers))
             if progress is not None:
-                progress(self._file.progress)
+                progress(self.progress)
 
     def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
         """Joint values (B, n) [rad or m] of every block, and payloads (B,) if there are some, after :meth:`check`."""
         count = 0
-        for raw, _ in self._numbers():
-            count += len(raw)
-            values = self.columns.to_si(raw)
-            yield values.q, values.payload
+        for block in self._numbers():
+            count += len(block.lines)
+            values = self.columns.to_si(block.numbers)
+            yield values["q"], values.get("payload")
         if count != self.rows:
             what, fix = f"file '{self.path}' changed while it was read", "run the command again"
             raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
-        columns = self.columns
-        given = columns.names, columns.table.decimal, ROWS_AT_ONCE, columns.hideable
-        return number_blocks(self._file, *given, all_hidden=columns.all_hidden)
+        """Numbers as written in the file, in blocks; nothing more from the first block with a mistake on.
+
+        MeasurementError for anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the
+        whole file first.
+        """
+        wanted, decimal, hideable = self.columns.names, self.columns.table.decimal, self.columns.hideable
+        named = [name for name, needed in self.texts.items() if needed or name in self.header]
+        places = find_columns(self.path, self.header, [*wanted, *named], self.sep)
+        mistakes = Mistakes(self.path, wanted, decimal, markers=len(hideable))
+        for lines in self.blocks(ROWS_AT_ONCE):
+            whole = mistakes.without_ragged(lines, len(self.header))
+            cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]
+            numbers, hidden = parse(cells, decimal), []
+            if numbers is None and hideable:
+                hidden = fill_hidden(cells, hideable, all_hidden=self.columns.all_hidden)
+                numbers = parse(cells, decimal)
+            if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
+                mistakes.add([line for line, _ in whole], cells)
+            elif not mistakes:
+                if hidden:
+                    numbers[tuple(zip(*hidden, strict=True))] = math.nan
+                own = zip(named, places[len(wanted) :], strict=True)
+                found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
+                yield Block(numbers, found, [line for line, _ in lines])
+        mistakes.raise_first()
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
-        largest, signs = None, _Signs(self.path, self.columns)
-        unseen = [places for places, _ in self.columns.hideable]
-        self.rows = 0
-        for raw, lines in self._numbers():
+        columns, largest = self.columns, None
+        checks = [group.check for group in columns.groups.values() for _ in group.names]
+        wrong = {place: (check, BadCells()) for place, check in enumerate(checks) if check is not None}
+        unseen, self.rows = columns.hideable, 0
+        for block in self._numbers():
+            raw = block.numbers
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
             largest = most if largest is None else torch.maximum(largest, most)
-            signs.add(raw, lines)
-            unseen = [places for places in unseen if bool(raw[:, places].isnan().all())]
-            self.rows += len(lines)
-            yield raw, lines
+            for place, (check, bad) in wrong.items():
+                values = raw[:, place]
+                for row in (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist():
+                    bad.add(block.lines[row], columns.names[place], f"{float(values[row]):g}")
+            unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
+            self.rows += len(block.lines)
+            yield block
         if largest is not None:
-            for text in self.columns.unlikely_units(largest):
+            for text in columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
-        signs.raise_first()
-        for places in unseen if self.rows else ():
-            names = few([self.columns.names[place] for place in places])
-            body = "frame" if self.columns.rotation else "marker"
-            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", f"leave this {body} out"
-            raise MeasurementError.of(what, expected=f"some line that shows this {body}", fix=fix)
-
-
-def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns) -> Measurements:
-    """Measurements of points, or of poses if there are rotations.
-
-    Raises:
-        MeasurementError: numbers that do not form a rotation.
-    """
-    table = columns.table
-    if table.convention is None:
-        plain = Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
-        return values.beside(plain)
-
-    frames = len(columns.triples)
-    numbers = values.rotations.unflatten(1, (frames, -1))
-    seen = ~numbers.isnan().any(2)
-    shown, names = seen.nonzero().tolist(), columns.rotation
-
-    def place(number: int) -> str:
-        row, frame = shown[number]
-        own = names[frame * numbers.shape[2] : (frame + 1) * numbers.shape[2]]
-        return f"file '{path}', line {lines[row]}, columns {', '.join(own)}"
-
-    rotations = numbers.new_full((len(numbers), frames, 3, 3), torch.nan)
-    try:
-        rotations[seen] = rotation_matrices(numbers[seen], table.convention, angle=columns.rotation_unit, place=place)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
-    single = frames == 1
-    std, turns = values.std, values.rotation_std
-    poses = Measurements.from_poses(
-        values.q,
-        of_frames(transforms_of_frames(rotations, values.points)),
-        columns.joints,
-        lever=table.lever,
-        position_std=std[:, 0] if single and std is not None else std,
-        rotation_std=turns[:, 0] if single and turns is not None else turns,
-        camera_on_tool=table.camera_on_tool,
-        doubt=False,
-    )
-    return values.beside(poses)
-
-
-class _Signs:
-    """Standard deviations that are not positive, and payloads that are negative: the first one, and how many."""
-
-    def __init__(self, path: Path, columns: Columns) -> None:
-        self.path, self.count = path, 0
-        self.names = [*columns.payload, *columns.deviations]  # the last columns
-        self.masses = len(columns.payload)
-        self.first: tuple[int, int, float] | None = None
-
-    def add(self, raw: Tensor, lines: Sequence[int]) -> None:
-        values = raw[:, raw.shape[1] - len(self.names) :]
-        wrong = values <= 0
-        wrong[:, : self.masses] = values[:, : self.masses] < 0
-        bad = wrong.nonzero()
-        self.count += len(bad)
-        if len(bad) and self.first is None:
-            row, column = (int(i) for i in bad[0])
-            self.first = lines[row], column, float(values[row, column])
-
-    def raise_first(self) -> None:
-        if self.first is not None:
-            line, column, value = self.first
-            what = f"file '{self.path}', line {line}, column '{self.names[column]}'"
-            count = f" ({self.count} such cells)" * (self.count > 1)
-            fix = "repair these lines, or leave this column out"
-            expected = "a mass of 0 or more" if column < self.masses else "a positive standard deviation"
-            raise MeasurementError.of(what, expected=expected, got=f"{value:g}{count}", fix=fix)
+        for check, bad in wrong.values():
+            if bad.first:
+                raise bad.error(self.path, check.expected, check.fix)
+        for own in unseen if self.rows else ():
+            names = few([columns.names[place] for place in own.values])
+            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave them out"
+            raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)

@@ -6,7 +6,6 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -15,16 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, outside_inference_mode
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
-from diffeo_calib.measurements.csv.cells import read_cells, repeated
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
-from diffeo_calib.measurements.csv.images import ImageColumns, corner_lines, written_columns
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Group, check_count, position_triples
+from diffeo_calib.measurements.csv.images import written_columns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.pose_frames import by_frame, inverse_poses, visible_rotation_numbers
-from diffeo_calib.measurements.readings import MILLIMETRES, ONE_DEVICE
+from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers
+from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.table_format import Names, TableFormat, flat_names
 
 Cells = Sequence[Sequence[float | str]]
@@ -79,8 +78,10 @@ def write_predictions(
         places = mean if frames is None else frames[..., :3, 3]
         parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), count, -1)
         for k in range(count):
-            parts.append(columns.lengths_from_si(torch.cat([places[:, k], spreads[:, k, :3]], dim=1)))
-            parts += [] if frames is None else rotation_parts(frames[:, k : k + 1], spreads[:, k, 3:], table)
+            parts.append(Group((), table.length).from_si(torch.cat([places[:, k], spreads[:, k, :3]], dim=1)))
+            if frames is not None and table.convention is not None and table.rotation_angle is not None:
+                turns = visible_rotation_numbers(frames[:, k : k + 1], table.convention, table.rotation_angle)
+                parts += [turns.flatten(1).cpu(), Group((), table.rotation_angle).from_si(spreads[:, k, 3:])]
         return torch.cat([*parts, *others], dim=1)
 
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
@@ -101,17 +102,6 @@ def write_rows(
         for block in blocks:
             rows = block.tolist() if isinstance(block, Tensor) else block
             file.write(csv_text(([_cell(value, table) for value in row] for row in rows), table.sep))
-
-
-def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
-    """Rotations (N, T k) of frames (N, T, 4, 4), and their standard deviations (N, 3 T) if known, in the file's units.
-
-    NaN where hidden.
-    """
-    unit = table.rotation_angle or "rad"
-    numbers = visible_rotation_numbers(frames, table.convention or "rotvec", unit).flatten(1).cpu()
-    known = None if std is None else std.flatten(1).cpu()
-    return [numbers] if known is None else [numbers, known.rad2deg() if unit == "deg" else known]
 
 
 def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
@@ -230,88 +220,64 @@ def write_measurements(
         InputError: a file that cannot be written.
     """
     whole = Observations.joined([data])
-    sheet = _Sheet.of(whole, table, position, session)
     names = joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
-    columns = replace(sheet.columns, joints=names, kinds=kinds)
-    numeric = Columns.of(sheet.table, names, kinds, position_triples(columns.position) if columns.position else [])
+    columns, table = _sheet(whole, table, position, session)
+    columns = replace(columns, joints=names, kinds=kinds)
+    numeric = columns.numeric(table)
     check_count("joint columns", numeric.joints, whole.n, "joint")
-    _check_distinct(sheet, numeric)
-    parts = [sheet.cells(part, numeric) for part in whole.parts]
-    order = torch.cat([rows[lines] for rows, (_, lines) in zip(whole.index, parts, strict=True)]).argsort(stable=True)
-    cells: dict[str, list[float | str]] = {name: [""] * len(order) for name in numeric.names}
-    for done, (own, lines) in zip(accumulate((len(own[1]) for own in parts), initial=0), parts, strict=False):
-        for name in own:
-            cells.setdefault(name, [""] * len(order))[done : done + len(lines)] = own[name]
-    whole_lines = [list(line) for line in zip(*cells.values(), strict=True)]
-    write_rows(path, list(cells), [[whole_lines[k] for k in order.tolist()]], sheet.table)
-    return columns, sheet.table
+    twice = {*numeric.names} & {*columns.texts}
+    if twice:
+        what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(sorted(twice))} twice"
+        raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
+    found: list[tuple[int, dict[str, float | str]]] = []
+    for part, rows, sensor in zip(whole.parts, whole.index, _sensors(whole, columns), strict=True):
+        values, texts, lines = sensor.written(part, table)
+        known = {"q": part.q, "payload": part.payload, **part.drifting}
+        of_lines = {name: own if own is None else own[lines.to(own.device)] for name, own in known.items()}
+        cells = numeric.from_si({**of_lines, **values}) | texts
+        each = [dict(zip(cells, line, strict=True)) for line in zip(*cells.values(), strict=True)]
+        found += zip(rows[lines].tolist(), each, strict=True)
+    there = {name for _, cells in found for name in cells}
+    header = [name for name in (*numeric.names, *columns.texts) if name in there]
+    in_order = sorted(found, key=lambda line: line[0])
+    write_rows(path, header, [[[cells.get(name, "") for name in header] for _, cells in in_order]], table)
+    return columns, table
 
 
-@dataclass(frozen=True)
-class _Sheet:
-    """The columns of a table that is written.
+def _sheet(
+    whole: Observations, table: TableFormat, position: Names | None, session: str | None
+) -> tuple[TableColumns, TableFormat]:
+    """The columns, joints not named yet, and their format; by default those of :func:`write_measurements`."""
+    measured = [part for part in whole.parts if part.kind in ("position", "pose")]
+    if len(measured) > 1:
+        fix = "write them to two files"
+        raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
+    device, triples = measured[0] if measured else None, None
+    _check_held(device, whole, table, position)
+    if device is not None and device.corners is not None:
+        device, table = None, replace(table, camera_on_tool=False)
+    if device is not None:
+        triples = position_triples(position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes])
+        table = replace(_with_names(device, table, triples), remounted=device.remounted)
+    if whole.payload is not None and table.payload is None:
+        table = replace(table, payload=PAYLOAD)
+    table = replace(table, **{name: getattr(table, name) or name for name in whole.covariate_names})
+    names = set(whole.device_names) - {""}
+    if session is not None and not names:
+        raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
+    session = (session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
+    own = session if device is not None and device.session is not None else None
+    on = device and device.on and list(device.bodies.tips(device.on))
+    columns = TableColumns((), triples, _socket_columns(whole), _reading_columns(whole, session), own, on=on)
+    return columns, table
 
-    Args:
-        columns: those of each kind; its joints are not named yet. table: their format, with the names of deviations.
-        readings: columns of each part with readings, or images, by the part's identity.
-    """
 
-    columns: TableColumns
-    table: TableFormat
-    readings: dict[int, Any]
-
-    @classmethod
-    def of(cls, whole: Observations, table: TableFormat, position: Names | None, session: str | None) -> _Sheet:
-        """Names of the columns, by default those of :func:`write_measurements`."""
-        measured = [part for part in whole.parts if part.kind in ("position", "pose")]
-        if len(measured) > 1:
-            fix = "write them to two files"
-            raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
-        device, triples = measured[0] if measured else None, None
-        _check_held(device, whole, table, position)
-        if device is not None and device.corners is not None:
-            device, table = None, replace(table, camera_on_tool=False)
-        if device is not None:
-            triples = position_triples(position or device.position_names)
-            table = replace(_with_names(device, table, triples), remounted=device.remounted)
-        if whole.payload is not None and table.payload is None:
-            table = replace(table, payload=PAYLOAD)
-        table = replace(table, **{name: getattr(table, name) or name for name in whole.covariate_names})
-        names = set(whole.device_names) - {""}
-        if session is not None and not names:
-            raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
-        session = (session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
-        own = session if device is not None and device.session is not None else None
-        readings = _reading_columns(whole, session)
-        on = device and device.on and list(device.bodies.tips(device.on))
-        columns = TableColumns((), triples, _socket_columns(whole), tuple(readings.values()), own, on=on)
-        return cls(columns, table, readings)
-
-    def cells(self, part: Any, numeric: Columns) -> tuple[dict[str, list[Any]], Tensor]:
-        """The cells of the lines of one part, by name, in the units of the file, and the rows (M,) of these lines."""
-        found = _named(numeric.joints, numeric.joints_from_si(part.q))
-        known: Any = self.readings.get(id(part))
-        images = isinstance(known, ImageColumns)
-        if images:
-            pass
-        elif part.kind in ("position", "pose"):
-            found |= _position_cells(part, numeric)
-        elif part.kind == "socket":
-            found[SOCKET] = part.row_sockets
-        else:
-            scale = part.unit[1] if part.unit != MILLIMETRES else numeric.table.per_metre
-            scale = 1.0 if part.kind == "image" else scale
-            found |= _named(known.values, scale * part.reported.cpu())
-            found |= {} if part.std is None else _named(known.std, scale * part.reported_std.cpu())
-        if part.payload is not None and numeric.payload:
-            found[numeric.payload[0]] = part.payload.tolist()
-        found |= _named(numeric.covariates, part.covariates) if numeric.covariates else {}
-        devices = (one.device for one in self.columns.readings if one.device is not None)
-        session = known.device if images else self.columns.session or next(devices, None)
-        found |= {} if session is None or not any(part.device_names) else {session: part.device_names}
-        if images:
-            return corner_lines(part, found, numeric.table.per_metre)
-        return found, torch.arange(len(part), device=HOST)
+def _sensors(whole: Observations, columns: TableColumns) -> list[SensorColumns]:
+    """The columns of each part."""
+    readings, (first, *_) = iter(columns.readings), columns.sensors
+    positions = [part.kind in ("position", "pose") and part.corners is None for part in whole.parts]
+    kinds = zip(whole.parts, positions, strict=True)
+    return [first if own else columns.sockets if part.kind == "socket" else next(readings) for part, own in kinds]
 
 
 def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -> TableFormat:
@@ -319,7 +285,7 @@ def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -
     bodies = data.seen_bodies.shape[1]
     check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
     if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.frame_prefixes)
+        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.prefixes)
     if data.std is None:
         return table
     std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
@@ -337,38 +303,20 @@ def _socket_columns(whole: Observations) -> SocketColumns | None:
     return SocketColumns((SOCKET,), distances or None, part.sockets.distance_std, part.ball_tip)
 
 
-def _reading_columns(whole: Observations, session: str | None) -> dict[int, Any]:
-    """Columns of the parts with readings, by their identity; those of a second part of a kind with a number."""
-    found: dict[int, Any] = {}
-    taken: list[str] = []
+def _reading_columns(whole: Observations, session: str | None) -> tuple[Any, ...]:
+    """Columns of the parts with images or readings; those of a second part of a kind with a number."""
+    found, taken = [], list[str]()
     for part in whole.parts:
-        if part.columns.get("corners") is not None:
-            found[id(part)] = written_columns(part, session)
-            continue
-        if part.kind in ("position", "pose", "socket"):
-            continue
-        plain = part.value_names
-        taken.append(plain[0])
-        number = "" if (count := taken.count(plain[0])) == 1 else str(count)
-        names = tuple(f"{name}{number}" for name in plain)
-        std = () if part.std is None else tuple(f"std_{name}" for name in names)
-        given = part.kind, names, session, part.offset_std, part.intrinsics
-        found[id(part)] = ReadingColumns(*given, std=std, on=part.on, unit=part.unit)
-    return found
-
-
-def _position_cells(data: Any, columns: Columns) -> dict[str, list[Any]]:
-    frames = data.frames if data.frames is None or data.board is None else inverse_poses(data.frames)
-    points = data.points if frames is None else frames[..., :3, 3]
-    found = _named([name for triple in columns.triples for name in triple], columns.lengths_from_si(points))
-    rotations = [] if frames is None else rotation_parts(frames, data.rotation_std, columns.table)
-    for names, values in zip((columns.rotation, columns.rotation_std), rotations, strict=False):
-        found |= _named(names, values)
-    return found | ({} if data.std is None else _named(columns.std, columns.lengths_from_si(data.std)))
-
-
-def _named(names: Sequence[str], values: Tensor) -> dict[str, list[Any]]:
-    return dict(zip(names, values.T.tolist(), strict=True))
+        if "corners" in part.columns:
+            found.append(written_columns(part, session))
+        elif part.kind not in ("position", "pose", "socket"):
+            taken.append(part.value_names[0])
+            number = "" if (count := taken.count(taken[-1])) == 1 else str(count)
+            names = tuple(f"{name}{number}" for name in part.value_names)
+            std = () if part.std is None else tuple(f"std_{name}" for name in names)
+            given = part.kind, names, session, part.offset_std, part.intrinsics
+            found.append(ReadingColumns(*given, std=std, on=part.on, unit=part.unit))
+    return tuple(found)
 
 
 def _check_held(device: Any, whole: Observations, table: TableFormat, position: Names | None) -> None:
@@ -389,17 +337,3 @@ def _check_held(device: Any, whole: Observations, table: TableFormat, position: 
         got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
         fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
         raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
-
-
-def _check_distinct(sheet: _Sheet, numeric: Columns) -> None:
-    """Refuse a name for two columns."""
-    columns = sheet.columns
-    names = [*numeric.names, *([] if columns.sockets is None else columns.sockets.names)]
-    for own in columns.readings:
-        names += [*(own.values if isinstance(own.values, tuple) else ()), *own.std]
-    names += {name for name in (columns.session, *(own.device for own in columns.readings)) if name is not None}
-    twice = repeated(names)
-    if twice:
-        fix = "rename the joints or positions"
-        what = "the names of the columns"
-        raise MeasurementError.of(what, expected="distinct names", got=f"{listed(twice)} twice", fix=fix)
