@@ -49,15 +49,10 @@ UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: 
 
 
 class Around(NamedTuple):
-    """Rows around the places of a model, what may change of their devices, and (N,) where they are among these."""
+    """Rows around the places of a model, and what may change of robot, tool and devices."""
 
     data: TangentData
-    devices: Callable[[], list[Hypothesis]]
-    index: Tensor
-
-    def changes(self) -> list[Hypothesis]:
-        """Changes of robot, tool and devices that are tested."""
-        return changes_of(self.data, (one._replace(effects=one.effects[self.index]) for one in self.devices()))
+    changes: Callable[[], list[Hypothesis]]
 
 
 @dataclass(eq=False)
@@ -157,15 +152,15 @@ class CampaignModel:
         process = some.process(self.scales)
         later = [row for row in old if row not in place_of]
         if later:
-            process = process.given(*self._told(self.around(table, later).data))
-        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table, window).data}
+            process = process.given(*self._told(self.around(table.rows(later)).data))
+        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table.rows(window)).data}
         own |= {"taken": _flags([verdicts[row].accepted for row in window]), "ratios": list(self.ratios)}
         errors, own["compared"] = self._errors()
         own["target"] = process.expected(errors)
         candidates, row = self.asked[0], self.like
         rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
         like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
-        options, (own["noise"],) = self._told(self._around(like).data)
+        options, (own["noise"],) = self._told(self.around(like).data)
         own |= {"options": process.expected(options), "open": self.placed.sees(self.like, candidates)}
         return replace(self, **own, seen=len(table))
 
@@ -275,7 +270,7 @@ class CampaignModel:
         row = len(table) - 1
         self.window.append(row)
         try:
-            around = self.around(table, self.window)
+            around = self.around(table.rows(list(self.window)))
         except DiffeoCalibError:
             self.window.pop()
             raise
@@ -351,7 +346,7 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[row - 1],
         }
         before, noise = self._told(data.rows(torch.arange(len(data.x) - 1, device=HOST)))
-        each = self.around(table, [row] * len(joints), torch.stack([*joints.values()])).data
+        each = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()]))).data
         for number, text in enumerate(joints):
             own, own_noise = self._told(each.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
             yield text, self._seen(before.joined(own), [*noise, *own_noise])
@@ -365,16 +360,8 @@ class CampaignModel:
         at = self.process.expected(numbers)
         return Seen(numbers, numbers.target - at.mean, numbers.add_blocks(at.covariance, noise))
 
-    def around(self, table: Any, numbers: Sequence[int], joints: Tensor | None = None) -> Around:
-        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know.
-
-        Args:
-            joints: (N, n) in place of theirs.
-        """
-        others = table.rows(list(numbers))
-        return self._around(others if joints is None else with_joints(others, joints))
-
-    def _around(self, others: Any) -> Around:
+    def around(self, others: Any) -> Around:
+        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know."""
         known = self.placed.data
         unknown = set(others.device_names) - set(known.device_names)
         if unknown:
@@ -385,7 +372,8 @@ class CampaignModel:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        return Around(data.rows(index), lambda: placed.placement.hypotheses(data, said=False), index)
+        rows = data.rows(index)
+        return Around(rows, lambda: changes_of(rows, placed.placement.hypotheses(data, said=False), index))
 
     def _errors(self) -> tuple[Numbers, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.

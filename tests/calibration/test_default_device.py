@@ -195,7 +195,7 @@ def test_tails_and_leave_one_out(measured: Measured) -> None:
 def test_change_points(measured: Measured) -> None:
     data, scales = measured.tangent_data, measured.scales
     effects, order = normal(16, data.y.shape[1], 4, seed=6), torch.arange(16)
-    same(lambda: [change_row(effects, data.process(scales), order, 3)])
+    same(lambda: [change_row(effects, data.process(scales), order)])
     same(lambda: [one.size for one in findings(changes_of(data), data.process(scales), order)])
 
 

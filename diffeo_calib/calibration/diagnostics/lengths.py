@@ -59,16 +59,14 @@ class Length(NamedTuple):
         )
 
 
-def lengths(
-    data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = (), *, seed: int = 0
-) -> list[Length]:
+def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
     """Lengths against what they are said to be: that of the whole robot first.
 
     Args:
         data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
-            length. seed: draws the rows where there are too many.
+            length.
     """
-    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed)
+    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     process, found = some.process(usual(scales)), list[Length]()
     for one in (*_lengths_of(some), *(each._replace(effects=each.effects[rows]) for each in devices)):
         evidence = Evidence.of(process.numbers.of_table(some.motions_in_numbers(one.effects)), process)

@@ -111,17 +111,15 @@ def change_during(
     scales: Hyperparameters,
     left_out: LeaveOneOut,
     devices: Iterable[Hypothesis] = (),
-    *,
-    seed: int = 0,
 ) -> str | None:
     """A sentence about the clearest change during the measurements, with the row, the size and what to do; or None.
 
     Args:
         numbers: (N,) numbers of the rows; their order is that of the measurements.
         data: the measurements. scales: those of the model. left_out: leave-one-out errors with these.
-        devices: what may change of devices in unknown places. seed: draws the rows where there are too many.
+        devices: what may change of devices in unknown places.
     """
-    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed)
+    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     if len(rows) < 4 * gates.CHANGE_ROWS:
         return None
     least = gates.CHANGE_NOISE_SHARE * float(some.new_noise(scales).trace().sqrt())
@@ -129,8 +127,7 @@ def change_during(
     order = numbers.argsort()
     usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
     excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
-    own = (one._replace(effects=one.effects[rows]) for one in devices)
-    found = findings(changes_of(some, own), process, order, excess=excess)
+    found = findings(changes_of(some, devices, rows), process, order, excess=excess)
     likely = [one for one in found if one.displacement > least]
     if not likely or len(found) * min(one.chance for one in likely) > gates.CHANGE_CHANCE:
         return None
@@ -175,9 +172,9 @@ def findings(
     return found
 
 
-def change_row(effects: Tensor, process: Process, order: Tensor, fewest: int = gates.CHANGE_ROWS) -> int:
-    """Place in the order (N,) of the row from which effects (N, R, U) explain most, ``fewest`` rows on either side."""
-    (n, _, unknowns), owner = effects.shape, process.numbers.owner
+def change_row(effects: Tensor, process: Process, order: Tensor) -> int:
+    """Place in the order (N,) of the row from which effects (N, R, U) explain most, some rows on either side."""
+    (n, _, unknowns), owner, fewest = effects.shape, process.numbers.owner, gates.CHANGE_ROWS
     E = process.numbers.of_table(effects)
 
     def by_row(values: Tensor) -> Tensor:
@@ -232,11 +229,11 @@ def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
     return min(1.0, density * ((1 - unknowns / gain) * 2.0 * log((1 - edge) / edge) + 4.0 / gain))
 
 
-def changes_of(data: TangentData, devices: Iterable[Hypothesis] = ()) -> list[Hypothesis]:
+def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Tensor | None = None) -> list[Hypothesis]:
     """What may change of robot, tool, measuring frame, and devices, with effects on what rows tell.
 
     Args:
-        devices: with effects on all coordinates of these rows.
+        devices: with effects on more rows, of which these have the numbers ``index`` (N,).
     """
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
     base, markers = frame_slopes(points, points.mean((0, 1))), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
@@ -256,7 +253,8 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = ()) -> list[Hy
         if joint > 0 or not data.held:  # without a device no row shows an offset of the first joint
             unit = "mrad" if data.space.periodic[joint] else "mm"
             found.append(Hypothesis(name, data.jacobian[..., joint, None], (unit, 1e-3), TWO_ROBOTS))
-    every = (one for one in (*found, *devices) if bool((one.effects != 0).any()))
+    found += [one._replace(effects=one.effects[index]) for one in devices]
+    every = (one for one in found if bool((one.effects != 0).any()))
     return [one._replace(effects=data.motions_in_numbers(one.effects)) for one in every]
 
 
