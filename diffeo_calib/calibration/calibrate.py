@@ -16,11 +16,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-import torch
-
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenScales, choose_scales, robot_problem
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
-from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful, lengths, warn_of_length
+from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
+from diffeo_calib.calibration.diagnostics.lengths import lengths, warn_of_lengths
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
@@ -36,7 +35,6 @@ from diffeo_calib.calibration.diagnostics.stuck_columns import (
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.judgement import warn_of_contradictions
-from diffeo_calib.calibration.placing.drift import worth_it
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.of_models import check_models
@@ -167,49 +165,19 @@ def calibrate(
         data = placed.tangent_data()
         warn_of_no_errors(robot, data, placed.registration, placed.identification)
         warn_of_stuck(data, stuck_columns(measurements))
-        _warn_of_what_is_open(robot, placed, data)
+        if placed.coordinates is None:
+            warn_of_what_is_open(data, [own.devices for own in placed.readings])
         stages = placed.registration, placed.identification
         choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
         chosen = choose(data, measurements, *stages)
         drifting = placed.drifting()
         if drifting is not None:
             again = choose(drifting.tangent_data(), measurements, *stages)
-            placed, chosen = (drifting, again) if worth_it(chosen.left_out, again.left_out) else (placed, chosen)
+            if worth_it(chosen.left_out.errors, again.left_out.errors):
+                placed, chosen = drifting, again
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, note=note, warned=warned)
-
-
-def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float | None]:
-    """Lengths against the robot's description, and by how much one that is too improbable moves points, m."""
-    data = chosen.data
-    found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(data))
-    worst = doubtful(found)
-    if worst is None:
-        return found, None
-    warn_of_length(worst)
-    return found, worst.displacement * 3**0.5
-
-
-def _change(placed: Placed, chosen: ChosenScales) -> str | None:
-    """A sentence about what changed during the measurements."""
-    numbers, data, placement = placed.data.line_numbers, chosen.data, placed.placement
-    return change_during(numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(data))
-
-
-def _warn_of_what_is_open(robot: Tree, placed: Placed, data: TangentData) -> None:
-    """Warn of joints and directions of the ball that readings by themselves do not show."""
-    if placed.coordinates is not None or data.shared is None:
-        return
-    whole = data.nominal.jacobian(data.x, data.theta)
-    shown = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
-    by_ball = data.sensitivities[..., data.nominal.geometry.slices["tool"]].flatten(0, 1)
-    shared = data.shared.flatten(0, 1)
-    shared = shared / shared.norm(dim=0).clamp(min=1e-12)
-    known = torch.linalg.lstsq(shared, by_ball, rcond=1e-6, driver="gelsd").solution  # moved devices do as well
-    tilt = torch.linalg.svdvals(by_ball - shared @ known) / data.coordinates**0.5
-    names = dict(zip(robot.joint_names, shown.tolist(), strict=True))
-    warn_of_what_is_open([own.devices for own in placed.readings], names, tilt)
 
 
 def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: Progress) -> Fit:
@@ -243,19 +211,23 @@ def _result(
     robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, *, note: str, warned: list[str]
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
-    fitted_map = _covariances(fitted.model, placed)
+    data, scales, fitted_map = chosen.data, chosen.selection.scales, _covariances(fitted.model, placed)
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
+    explained, found = parts(model), outliers(model, placed, data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     wrong = list({one.row for one in found})
     warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck_columns(placed.data))
-    changed = placed.mislabelled(model, found) or _change(placed, chosen)
+    changed = placed.mislabelled(model, found)
+    if changed is None:
+        devices = placed.placement.hypotheses(data, said=False)
+        changed = change_during(placed.data.line_numbers, data, scales, chosen.left_out, devices)
     warn_of_contradictions(model, placed.coordinates, found, changed)
-    warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
-    found_lengths, doubt = _lengths(placed, chosen)
+    warn_of_rounding(robot, placed.data, data, chosen.left_out)
+    found_lengths = lengths(data, scales, placed.placement.hypotheses(data, said=True))
+    doubt = warn_of_lengths(found_lengths)
     rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(
         model=CalibratedKinematics(
@@ -267,7 +239,7 @@ def _result(
             placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),
-            scales=chosen.selection.scales.vector,
+            scales=scales.vector,
         ),
         placed=placed,
         selection=chosen.selection,

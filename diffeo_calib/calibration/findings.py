@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.quantiles import chi2_above, known, largest_known
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, known, largest_known
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -21,12 +22,6 @@ from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 
-FALSE_ALARM_PROBABILITY = 0.01
-"""Probability that clean Gaussian data have any outlier."""
-UNCHOSEN_FACTOR = 9.0
-"""On the squared distance of an outlier where the rows are too few to choose scales: defaults may be overconfident."""
-REMAINING_ERROR = 0.2
-"""Largest part of a row's error that may remain with an explanation that is reported."""
 MOST_CONFIGURATIONS = 8000
 """Configurations on which the parts of a model are measured."""
 FAR = "far from where the other rows predict it"
@@ -145,8 +140,8 @@ def outliers(
         left_out: their leave-one-out errors.
     """
     noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
-    level = FALSE_ALARM_PROBABILITY / len(known(squares))
-    factor = UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
+    level = gates.OUTLIER_CHANCE / len(known(squares))
+    factor = gates.UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
     bad = squares > factor * noise.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
     each = left_out.errors.unflatten(1, (noise.bodies, -1))
     distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
@@ -164,6 +159,17 @@ def outliers(
             reading = per_unit * float(shown.errors[number, 0]), unit
             found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR, reading=reading))
     return sorted(found, key=lambda outlier: -outlier.distance)
+
+
+def excluded(squares: Tensor, freedom: int, factor: float = 1.0) -> Tensor:
+    """Which squared distances (N, bodies), chi-squared, are too large by chance, or beside most of the others.
+
+    Args:
+        factor: by which an error must exceed what chance explains.
+    """
+    seen = known(squares)
+    size = max(1.0, float(seen.median()) / chi2_median(freedom))
+    return squares > factor**2 * size * chi2_above(gates.OUTLIER_CHANCE / len(seen), freedom)
 
 
 def found_outliers(
@@ -197,7 +203,7 @@ def found_outliers(
 def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
     """Probable cause of an outlier, in words."""
     own = (predicted[row] - data.points[row]).norm(dim=-1)
-    small = REMAINING_ERROR * float(known(own).max())
+    small = gates.REMAINING_ERROR * float(known(own).max())
     seen = data.seen_bodies
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
     other = _exchanged_with(row, body, data, predicted, small)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import log
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Step, out_of_step
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.misplaced_rows import Step, out_of_step
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.expected_errors import ExpectedError
-from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
+from diffeo_calib.calibration.findings import Outlier, excluded, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     LARGEST_ERROR_PER_REACH,
@@ -34,51 +36,17 @@ from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates
 
 
-@dataclass(frozen=True)
-class BlockLimits:
-    """When wrong rows count as a block.
-
-    Args:
-        wrong: share of the rows of a block that are wrong.
-        fewest_rows: smallest number of wrong rows.
-        chance: probability that wrong rows which are spread at random look like a block.
-        excess: factor by which an error must exceed what the model's deviations exclude by chance: outside of the
-            rows of its fit a model may be overconfident.
-    """
-
-    wrong: float = 0.9
-    fewest_rows: int = 4
-    chance: float = 1e-3
-    excess: float = 3.0
-
-
-LIMITS = BlockLimits()
-PAIR = "pair every configuration with its own measured values: was a line lost or doubled there?"
-
-
 def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
     """Measurements that took no part in a fit and that its model excludes, the worst first.
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
     data = sensor_of(data).with_points(data, model)
-    errors, squares = _errors(model, data)
-    freedom = errors.shape[-1]
-    seen = known(squares)
-    size = max(1.0, float(seen.median()) / chi2_median(freedom))
-    limit = LIMITS.excess**2 * size * chi2_above(FALSE_ALARM_PROBABILITY / len(seen), freedom)
-    return found_outliers(model, data, squares > limit, errors[..., :3].norm(dim=-1))
-
-
-def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Tensor]:
-    """Errors (N, bodies, 3 or 6) in m and rad, and their squared distances (N, bodies) by the model's deviations.
-
-    NaN for hidden markers.
-    """
     found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
-    errors = data.bodies.errors(data, found.points)
-    solved = torch.linalg.solve(found.covariance, errors[..., None])[..., 0]
-    return errors, (errors * solved).sum(-1)
+    errors = data.bodies.errors(data, found.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
+    squares = (errors * torch.linalg.solve(found.covariance, errors[..., None])[..., 0]).sum(-1)
+    bad = excluded(squares, errors.shape[-1], gates.OVERCONFIDENT)
+    return found_outliers(model, data, bad, errors[..., :3].norm(dim=-1))
 
 
 def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
@@ -86,11 +54,6 @@ def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
     return out_of_step(
         model.at_payloads(data.payload)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data)
     )
-
-
-def step_text(step: Step) -> str:
-    """One sentence about rows out of step."""
-    return sentence(step.sentence, got=f"{step.rows} rows that fit there, and not at their own joints", fix=PAIR)
 
 
 def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outlier]) -> str | None:
@@ -131,24 +94,24 @@ def warn_of_contradictions(
     if own is not None:
         place = {row: number for number, row in enumerate(own.rows.tolist())}
         wrong = [replace(one, row=place[one.row]) for one in wrong if one.row in place]
-        steps = steps_of(model, own.table) if len(wrong) >= STEP_LIMITS.fewest_rows else []
-        text = step_text(steps[0]) if steps else moved or block_text(model, own.table, wrong)
+        steps = steps_of(model, own.table) if len(wrong) >= gates.LAG_ROWS else []
+        text = steps[0].sentence() if steps else moved or block_text(model, own.table, wrong)
     if text is not None:
         warn_user(text)
 
 
-def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] | None:
+def find_block(wrong: Tensor) -> tuple[int, int] | None:
     """First and last + 1 of the rows (N,), in order, where wrong ones follow one another beyond chance; or None.
 
-    The segment with the largest likelihood ratio of ``limits.wrong`` against the overall share (S. Karlin,
+    The segment with the largest likelihood ratio of ``gates.BLOCK_SHARE`` against the overall share (S. Karlin,
     S. Altschul, "Methods for assessing the statistical significance of molecular sequence features", 1990).
     """
     count, n = int(wrong.sum()), len(wrong)
     share = count / n
-    if count < limits.fewest_rows or share >= limits.wrong:
+    if count < gates.BLOCK_ROWS or share >= gates.BLOCK_SHARE:
         return None
-    gain, loss = log(limits.wrong / share), log((1 - limits.wrong) / (1 - share))
-    best, score, start, place = log(n / limits.chance), 0.0, 0, None
+    gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
+    best, score, start, place = log(n / gates.BLOCK_CHANCE), 0.0, 0, None
     for row, bad in enumerate(wrong.tolist()):
         if score <= 0:
             score, start = 0.0, row
@@ -156,13 +119,6 @@ def find_block(wrong: Tensor, limits: BlockLimits = LIMITS) -> tuple[int, int] |
         if score > best:
             best, place = score, (start, row + 1)
     return place
-
-
-LARGE_PER_REACH, LARGE_PER_USUAL = 0.01, 20.0
-"""Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
-are no errors of a calibrated robot; nor are those above a tenth of its reach."""
-MOST_LARGE = 0.25
-"""Share of the rows from which such errors fail a fit."""
 
 
 def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:
@@ -173,9 +129,9 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
         usual: median error of the rows of the fit after a geometric calibration, m.
     """
     reach = model.robot.reach
-    limit = min(max(LARGE_PER_REACH * reach, LARGE_PER_USUAL * usual), LARGEST_ERROR_PER_REACH * reach)
+    limit = min(max(gates.LARGE_PER_REACH * reach, gates.LARGE_PER_USUAL * usual), LARGEST_ERROR_PER_REACH * reach)
     share = float((known(found.errors) > limit).double().mean())
-    if share > MOST_LARGE:
+    if share > gates.MOST_LARGE:
         raise MeasurementError.of(
             f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
             expected="errors of a calibrated robot",
@@ -185,63 +141,45 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
         )
 
 
-LARGE_PER_EXPECTED = 2.0
-"""RMS errors from this multiple of the expected ones on are warned about."""
-
-
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(NamedTuple):
     """What errors mean.
 
     Args:
-        causes: sentences about likely causes of large errors. outliers: positions that look wrong among ``rows``
-            evenly chosen ones.
+        refusal: why they are not those of this robot. causes: sentences about likely causes of large errors.
+        outliers: positions that look wrong among ``rows`` evenly chosen ones.
     """
 
-    causes: list[str] = field(default_factory=list)
-    outliers: list[Outlier] = field(default_factory=list)
+    refusal: str | None = None
+    causes: Sequence[str] = ()
+    outliers: Sequence[Outlier] = ()
     rows: int = 0
 
 
-def impossible_or_refused(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
-    """See :func:`~diffeo_calib.kinematics.evaluation.impossible_errors`.
-
-    Raises:
-        MeasurementError: another reading of the table, or something that moved, explains the rows; it is named.
-    """
-    seen = positions_of(model, places, data)
-    if seen is not None and found.positions is not None and impossible(model, found.positions):
-        some = _refused_steps(model, seen)
-        if not motions(model, some):
-            refuse_mistakes(model.robot, some)
-    return impossible_errors(model, places, data, found)
-
-
 def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
-    """Name rows that look wrong, and likely causes of large errors; arguments as of :func:`impossible_or_refused`.
+    """Name rows that look wrong, and likely causes of large errors.
+
+    Args:
+        model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
 
     Raises:
-        MeasurementError: rows out of step with their joints.
+        MeasurementError: another reading of the table, or something that moved, explains impossible errors.
     """
     seen = positions_of(model, places, data)
     if seen is None or found.positions is None:
-        return Judgement()
-    some = _refused_steps(model, seen)
+        return Judgement(impossible_errors(model, places, data, found))
+    some = some_rows(seen)
+    for step in steps_of(model, some):
+        return Judgement(step.sentence())
+    if impossible(model, found.positions.median) and not motions(model, some):
+        refuse_mistakes(model.robot, some)
+    refusal = impossible_errors(model, places, data, found)
     causes = causes_of(model, some, found.positions)
-    if causes:
-        return Judgement(causes)
+    if refusal is not None or causes:
+        return Judgement(refusal, causes)
     wrong = contradicted(model, some)
     block = block_text(model, some, wrong)
     causes = [block] if block is not None else larger_than_expected(model, seen, found.positions) * (not wrong)
-    return Judgement(causes, wrong, len(some))
-
-
-def _refused_steps(model: CalibratedKinematics, data: Measurements) -> Measurements:
-    """Evenly chosen rows; MeasurementError if they are out of step with their joints."""
-    some = some_rows(data)
-    for step in steps_of(model, some):
-        raise MeasurementError(step_text(step))
-    return some
+    return Judgement(None, causes, wrong, len(some))
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:
@@ -257,7 +195,7 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
 def larger_than_expected(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> list[str]:
     """A sentence about errors above twice the expected ones."""
     expected = expected_rms(model, data, errors.errors.shape[1])
-    if errors.rms < LARGE_PER_EXPECTED * expected:
+    if errors.rms < gates.LARGE_PER_EXPECTED * expected:
         return []
     what = (
         f"the errors are {errors.rms / expected:.1f} times as large as the model expects: RMS {1e3 * errors.rms:.3f} mm"

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few, variance_ratio
-from diffeo_calib.calibration.diagnostics.moved_devices import Cause, causes_of
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import factor, greedy
 from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.verdicts import LIMITS, Seen, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import Seen, Verdict, exchanged, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
@@ -34,6 +35,7 @@ from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -47,16 +49,10 @@ UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: 
 
 
 class Around(NamedTuple):
-    """Rows around the places of a model, what may change of their devices, and (N,) where they are among these."""
+    """Rows around the places of a model, and what may change of robot, tool and devices."""
 
     data: TangentData
-    devices: Callable[[], list[Cause]]
-    index: Tensor
-
-    def causes(self) -> list[Cause]:
-        """Changes of robot, tool and devices that are tested."""
-        devices = [one._replace(effects=one.effects[self.index]) for one in self.devices()]
-        return [one.told_by(self.data) for one in (*causes_of(self.data), *devices) if bool((one.effects != 0).any())]
+    changes: Callable[[], list[Hypothesis]]
 
 
 @dataclass(eq=False)
@@ -147,7 +143,7 @@ class CampaignModel:
         judged = [one for one in verdicts if names[one.row] in placed]
         accepted = [one.row for one in judged if one.accepted]
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
-        window = [one.row for one in judged[-LIMITS.window :] if one.row >= first]
+        window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
         old = [row for row in accepted if row not in window]
         known = self.placed.data.line_numbers.tolist()
         place_of = {row: number for number, row in enumerate(known)}
@@ -156,15 +152,15 @@ class CampaignModel:
         process = some.process(self.scales)
         later = [row for row in old if row not in place_of]
         if later:
-            process = process.given(*self._told(self.around(table, later).data))
-        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table, window).data}
+            process = process.given(*self._told(self.around(table.rows(later)).data))
+        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table.rows(window)).data}
         own |= {"taken": _flags([verdicts[row].accepted for row in window]), "ratios": list(self.ratios)}
         errors, own["compared"] = self._errors()
         own["target"] = process.expected(errors)
         candidates, row = self.asked[0], self.like
         rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
         like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
-        options, (own["noise"],) = self._told(self._around(like).data)
+        options, (own["noise"],) = self._told(self.around(like).data)
         own |= {"options": process.expected(options), "open": self.placed.sees(self.like, candidates)}
         return replace(self, **own, seen=len(table))
 
@@ -274,7 +270,7 @@ class CampaignModel:
         row = len(table) - 1
         self.window.append(row)
         try:
-            around = self.around(table, self.window)
+            around = self.around(table.rows(list(self.window)))
         except DiffeoCalibError:
             self.window.pop()
             raise
@@ -283,14 +279,14 @@ class CampaignModel:
         found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
         fits = found.fits(typical)
         if fits:
-            self.ratios.append(found.square / chi2_above(1.0 - LIMITS.typical_share, found.freedom))
+            self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
         cause = "" if fits else self._cause(table, around.data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
         own = [verdicts[number] for number in self.window]
         flags = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        how: Any = {"single": found, "typical": typical}
-        change = None if cause else find_change(seen, self.window, around.causes(), flags, **how)
+        how: Any = {"single": found, "typical": typical, "coordinates": around.data.y.shape[1]}
+        change = None if cause else find_change(seen, self.window, around.changes(), flags, **how)
         if change is not None:
             change = replace(change, line=lines[change.row])
             for number in self.window:
@@ -303,14 +299,14 @@ class CampaignModel:
     @property
     def typical(self) -> float:
         """How large right squares are relative to what chance exceeds in a share of the rows: at least one."""
-        last = sorted(self.ratios[-LIMITS.typical_rows :])
-        if len(last) < LIMITS.fewest_typical:
-            return LIMITS.at_first
-        return max(1.0, last[int(LIMITS.typical_share * len(last))])
+        last = sorted(self.ratios[-gates.TYPICAL_ROWS :])
+        if len(last) < gates.FEWEST_TYPICAL:
+            return gates.TYPICAL_AT_FIRST
+        return max(1.0, last[int(gates.TYPICAL_SHARE * len(last))])
 
     def _move_on(self, data: TangentData, verdicts: Sequence[Verdict]) -> None:
         """Take the first row of a full window into the process, if it was accepted."""
-        first, index = int(len(self.window) > LIMITS.window), torch.arange(len(self.window), device=HOST)
+        first, index = int(len(self.window) > gates.WINDOW), torch.arange(len(self.window), device=HOST)
         if first and verdicts[self.window[0]].accepted:
             self.process = self.process.given(*self._told(data.rows(index[:1])))
         self.window, self.last = self.window[first:], data.rows(index[first:])
@@ -322,7 +318,7 @@ class CampaignModel:
         numbers, mine = seen.numbers, seen.numbers.owner == last
 
         def fits(other: Seen, some: Tensor | None = None, freedom: int = freedom) -> bool:
-            return measure(other, last, known, freedom, some).fits(self.typical, LIMITS.undone)
+            return measure(other, last, known, freedom, some).fits(self.typical, gates.UNDONE_CHANCE)
 
         y = data.y[last : last + 1]
         bodies = data.noise_model.bodies
@@ -350,7 +346,7 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[row - 1],
         }
         before, noise = self._told(data.rows(torch.arange(len(data.x) - 1, device=HOST)))
-        each = self.around(table, [row] * len(joints), torch.stack([*joints.values()])).data
+        each = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()]))).data
         for number, text in enumerate(joints):
             own, own_noise = self._told(each.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
             yield text, self._seen(before.joined(own), [*noise, *own_noise])
@@ -364,16 +360,8 @@ class CampaignModel:
         at = self.process.expected(numbers)
         return Seen(numbers, numbers.target - at.mean, numbers.add_blocks(at.covariance, noise))
 
-    def around(self, table: Any, numbers: Sequence[int], joints: Tensor | None = None) -> Around:
-        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know.
-
-        Args:
-            joints: (N, n) in place of theirs.
-        """
-        others = table.rows(list(numbers))
-        return self._around(others if joints is None else with_joints(others, joints))
-
-    def _around(self, others: Any) -> Around:
+    def around(self, others: Any) -> Around:
+        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know."""
         known = self.placed.data
         unknown = set(others.device_names) - set(known.device_names)
         if unknown:
@@ -384,7 +372,8 @@ class CampaignModel:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        return Around(data.rows(index), lambda: placed.placement.changes(data), index)
+        rows = data.rows(index)
+        return Around(rows, lambda: changes_of(rows, placed.placement.hypotheses(data, said=False), index))
 
     def _errors(self) -> tuple[Numbers, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.

@@ -4,9 +4,8 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 
 * of one row: its unit, its joints are those of another row, two markers are exchanged, one marker is wrong. A cause is
   named if the row fits when it is undone.
-* from a row k on: a device has moved, a marker has slipped, a joint has another offset. With w = L^-1 e the whitened
-  errors of the last rows in order and B the effects of a cause, zero before row k, the cause gains |P w|^2, P the
-  projection onto L^-1 B; chance gains chi-squared (diagnostics/moved_devices.py). Rows that were taken in one by one
+* from a row k on: a device has moved, a marker has slipped, a joint has another offset. By chance such a hypothesis
+  gains chi-squared (diagnostics/hypotheses.py) from the errors of the last rows. Rows that were taken in one by one
   count again here: small changes show in several rows only. A single wrong row, which six unknowns of a device explain
   as well, is no change.
 """
@@ -22,43 +21,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.moved_devices import Cause
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.process.numbers import Numbers
-
-
-@dataclass(frozen=True)
-class JudgementLimits:
-    """When a row counts as wrong, and when a cause is named.
-
-    Args:
-        chance: probability that a right row counts as wrong. undone: the same once its mistake is undone.
-        change: probability that chance gains as much as a named change. A campaign of 100 rows asks for about 10,000
-            changes, most of them much alike.
-        remaining: probability, by chance, of the errors that a named change leaves.
-        fewest_rows: rows after a change. window: last rows among which changes are sought.
-        spare: numbers beyond the unknowns of a change that must show it.
-        typical_rows: last accepted rows whose squares, at this share of them, say how large right ones are relative
-            to chance; fewest_typical: of them, with fewer it is ``at_first``. A model of few rows is overconfident.
-        told_apart: gain by which a change must exceed that of another cause; else both are named. By as much it must
-            exceed what is gained if nothing but the last row is wrong.
-    """
-
-    chance: float = 1e-8
-    undone: float = 1e-3
-    change: float = 1e-6
-    remaining: float = 1e-3
-    fewest_rows: int = 2
-    window: int = 12
-    spare: int = 3
-    typical_rows: int = 30
-    typical_share: float = 0.8
-    fewest_typical: int = 8
-    at_first: float = 2.0
-    told_apart: float = 6.0
-
-
-LIMITS = JudgementLimits()
+from diffeo_calib.sensors.devices import Hypothesis
 
 
 @dataclass(frozen=True)
@@ -159,7 +126,7 @@ class Measure(NamedTuple):
     error: float
     expected: float
 
-    def fits(self, typical: float, chance: float = LIMITS.chance) -> bool:
+    def fits(self, typical: float, chance: float = gates.WRONG_ROW_CHANCE) -> bool:
         """Whether chance explains it; ``typical``: size of right squares relative to chi-squared."""
         return self.square <= typical * chi2_above(chance, self.freedom)
 
@@ -191,48 +158,45 @@ def exchanged(y: Tensor, bodies: int) -> Iterator[tuple[str, Tensor]]:
 def find_change(
     seen: Seen,
     numbers: list[int],
-    causes: Sequence[Cause],
+    hypotheses: Sequence[Hypothesis],
     flags: tuple[Tensor, Tensor],
     *,
     single: Measure,
     typical: float,
-    limits: JudgementLimits = LIMITS,
+    coordinates: int,
 ) -> Change | None:
     """Change found among rows in order, the last one included; None if chance explains everything.
 
     Args:
-        seen: N rows as earlier ones predict them. numbers: theirs. causes: effects (N, R, U) on what they tell, m.
+        seen: N rows as earlier ones predict them. numbers: theirs. hypotheses: effects (N, R, U) on what they tell, m.
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
-        single: the distance of the last row. typical: see :meth:`Measure.fits`.
+        single: the distance of the last row. typical: see :meth:`Measure.fits`. coordinates: of the points of a row.
     """
-    if not causes:
+    if not hypotheses:
         return None
     known, doubted = flags
-    owner, found, sizes = seen.numbers.owner, [], [cause.effects.shape[2] for cause in causes]
-    effects = seen.numbers.of_table(torch.cat([cause.effects for cause in causes], 2))
-    for first in range(len(numbers) - limits.fewest_rows + 1):
+    owner, found = seen.numbers.owner, []
+    for first in range(len(numbers) - gates.ROWS_AFTER_CHANGE + 1):
         after = (owner >= first) & doubted[owner]
         error, covariance = seen.given(after, (owner < first) & known[owner])
-        low, whole = torch.linalg.cholesky(covariance), torch.cat([error[:, None], effects[after]], 1)
-        error, *each = torch.linalg.solve_triangular(low, whole, upper=False).split([1, *sizes], 1)
-        white = error[:, 0]
-        for cause, B, columns in zip(causes, effects[after].split(sizes, 1), each, strict=True):
-            spare = len(white) - B.shape[1]
-            if spare < limits.spare:
+        factor = torch.linalg.cholesky(covariance)
+        for one in hypotheses:
+            E = seen.numbers.of_table(one.effects)[after]
+            spare = len(E) - E.shape[1]
+            if spare < gates.SPARE_NUMBERS:
                 continue
-            u = torch.linalg.lstsq(columns, white, driver="gelsd").solution
-            fit = columns @ u
-            gain, left = float(fit.square().sum()) / typical, float((white - fit).square().sum()) / typical
-            if left <= chi2_above(limits.remaining, spare):
-                found.append((gain - B.shape[1] * log(len(white)), gain, first, cause, B @ u, u, len(white)))
+            evidence = Evidence.by(E, error, factor)
+            u, gain = evidence.size, float(evidence.gain) / typical
+            if evidence.total / typical - gain <= chi2_above(gates.LEFT_CHANCE, spare):
+                found.append((gain - E.shape[1] * log(len(E)), gain, first, one, E @ u, u, len(E)))
     best = max(found, key=lambda one: one[0], default=None)
-    if best is None or chi2_probability(best[1], len(best[5])) > limits.change:
+    if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None
-    score, _, first, cause, moved, u, count = best
-    if score < single.square / typical - single.freedom * log(count) + limits.told_apart:
+    score, _, first, what, moved, u, count = best
+    if score < single.square / typical - single.freedom * log(count) + gates.CHANGES_TOLD_APART:
         return None
-    others = {one[3].name for one in found if one[0] > score - limits.told_apart} - {cause.name}
-    unit, size = cause.unit or ("mm", 1e-3)
-    points = 3.0 if cause.basis is None else 3.0 * cause.basis.shape[2] / cause.basis.shape[1]  # numbers of a point
-    change = float(u.abs().max()) if cause.unit else float((points * moved.square().mean()).sqrt())
-    return Change(numbers[first], cause.name, change / size, unit, tuple(sorted(others)), cause.fix)
+    others = {one[3].name for one in found if one[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
+    unit, size = what.unit or ("mm", 1e-3)
+    points = 3.0 * seen.numbers.shape[1] / coordinates  # numbers of a point
+    change = float(u.abs().max()) if what.unit else float((points * moved.square().mean()).sqrt())
+    return Change(numbers[first], what.name, change / size, unit, tuple(sorted(others)), what.fix)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of
+from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cli.guesses import (
@@ -235,7 +235,7 @@ class Source:
         data = self.read(table)
         positions = measured_positions(data)
         if positions is not None:
-            return residual_of(self.robot, positions.largest_session())
+            return likely_mistakes.residual_of(self.robot, positions.largest_session())
         check_poses(data)
         own, readings = divided(data)
         if own is not None:
@@ -306,11 +306,11 @@ def _clear_reading(source: Source, formats: Mapping[Any, TableFormat], other: st
     for key, table in formats.items():
         data = source.positions(table)
         if data is not None:
-            residuals[key] = residual_of(source.robot, data)
+            residuals[key] = likely_mistakes.residual_of(source.robot, data)
     found = min(residuals, key=lambda key: residuals[key], default=None)
     others = [value for key, value in residuals.items() if key != found]
     best = residuals.get(found, LARGEST_RESIDUAL)
-    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+    if best >= LARGEST_RESIDUAL or any(value < gates.READINGS_TOLD_APART * best for value in others):
         return None
     than = f", {other} at least {1e3 * min(others):.3g} mm" if others else ""
     return found, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"

@@ -192,14 +192,9 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 
 
-def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
-    """Whether errors are too large to describe the robot: a median above a tenth of its reach."""
-    return implausibly_far(model, errors.median)
-
-
-def implausibly_far(model: CalibratedKinematics, distance: float) -> bool:
-    """Whether a median distance, m, is above a tenth of the robot's reach."""
-    return distance > LARGEST_ERROR_PER_REACH * model.robot.reach
+def impossible(model: CalibratedKinematics, median: float) -> bool:
+    """Whether a median error, m, is too large to describe the robot: above a tenth of its reach."""
+    return median > LARGEST_ERROR_PER_REACH * model.robot.reach
 
 
 def impossible_errors(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
@@ -214,13 +209,13 @@ def impossible_errors(model: CalibratedKinematics, places: Places, data: Any, fo
     for table, _ in divided(data)[1]:
         devices = places.devices[table.column_kind]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
-        if implausibly_far(model, float(away.median())):
+        if impossible(model, float(away.median())):
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
             fix += " (`device`, --session)"
             got = f"a median of {1e3 * float(away.median()):.4g} mm at the ball"
             return sentence("these errors are not those of a calibrated robot", got=got, fix=fix)
     seen = positions_of(model, places, data)
-    if seen is None or found.positions is None or not impossible(model, found.positions):
+    if seen is None or found.positions is None or not impossible(model, found.positions.median):
         return None
     some = some_rows(seen)
     if motions(model, some):

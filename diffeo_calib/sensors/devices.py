@@ -35,18 +35,20 @@ FEWEST_PER_DEVICE = 8
 """Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
 
 
-class Effect(NamedTuple):
-    """Something about a device that may be wrong, or change: its effect (N, r, U) on N rows, m.
+class Hypothesis(NamedTuple):
+    """Something that may be wrong, or change, of a device, the robot or its tool.
 
     Args:
-        name: in words. motion: zero in rows of other devices. unit: of a single unknown, and its size in m or relative;
-            None to report the motion. fix: what to do about it.
+        name: in words. effects: (N, r, U) derivatives of N rows by its unknowns, m. unit: of a single unknown, and its
+            size in m, rad or relative; None to report the motion. fix: what to do about it.
+        said: whether it is one number that a device is said to hold, such as a focal length; else it may change.
     """
 
     name: str
-    motion: Tensor
+    effects: Tensor
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"
+    said: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +171,10 @@ class Devices(ABC):
     def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
 
-    def changes(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
-        """What may change between rows of these devices (N,) at points (N, 3), m: by default where each stands."""
+    def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
+        """What may be wrong, or change between rows of these devices (N,) at points (N, 3), m: where each stands."""
         for name, own in self._of_each(self.observation(device).by_constants(points), device):
-            yield Effect(f"{self.kind} device '{name}'", own)
-
-    def doubts(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
-        """What the devices are said to hold, one number each, such as a focal length; arguments as above."""
-        yield from ()
+            yield Hypothesis(f"{self.kind} device '{name}'", own)
 
     def _of_each(self, effects: Tensor, device: Tensor) -> Iterator[tuple[str, Tensor]]:
         """The effects (N, r, U) on the rows of each device by itself, with its name."""

@@ -15,7 +15,7 @@ from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transfo
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,
     Devices,
-    Effect,
+    Hypothesis,
     numbers_text,
 )
 
@@ -91,20 +91,21 @@ class Cameras(Devices):
         moved = twist_transform(increments) @ self.poses
         return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
 
-    def doubts(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
-        """Focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""
+    def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
+        """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""
+        yield from super().hypotheses(points, device)
         image, fix = (
             self.observation(device).value(points),
             "check the intrinsic parameters, and the size of the images",
         )
         for name, own in self._of_each(image[..., None], device):
-            yield Effect(f"the focal length of '{name}'", own, ("%", 1e-2), fix)
+            yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, said=True)
         for axis in range(2):
             shift = torch.zeros_like(image[..., None])
             shift[:, axis, 0] = self.metres[device]
             for name, own in self._of_each(shift, device):
                 words = f"the principal point of '{name}' along {'uv'[axis]} (in focal lengths)"
-                yield Effect(words, own, ("%", 1e-2), fix)
+                yield Hypothesis(words, own, ("%", 1e-2), fix, said=True)
 
     def where(self, number: int) -> str:
         """The place."""

@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_use
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import Devices, Effect, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, Hypothesis, least_squares, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -99,13 +99,13 @@ class FixedPoints(Devices):
         free[3] = UNKNOWN_ZERO_M
         return replace(self, deviations=free)
 
-    def changes(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
+    def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """The zero, and the place of the fixed end."""
         effects = self.observation(device).by_constants(points)
-        yield Effect("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
+        yield Hypothesis("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
         for name, own in self._of_each(effects, device):
-            yield Effect(f"the zero of '{name}'", own[..., 3:], ("mm", 1e-3))
-            yield Effect(f"the fixed end of '{name}'", own[..., :3])
+            yield Hypothesis(f"the zero of '{name}'", own[..., 3:], ("mm", 1e-3))
+            yield Hypothesis(f"the fixed end of '{name}'", own[..., :3])
 
     def check_freed(self, noise: float, free_noise: float) -> None:
         """Lengths whose zero seems to be another one than the device's."""

@@ -20,7 +20,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import choose_scales
 from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
-from diffeo_calib.calibration.diagnostics.moved_devices import find_change_point
+from diffeo_calib.calibration.diagnostics.moved_devices import change_row, changes_of, findings
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import (
@@ -195,7 +195,8 @@ def test_tails_and_leave_one_out(measured: Measured) -> None:
 def test_change_points(measured: Measured) -> None:
     data, scales = measured.tangent_data, measured.scales
     effects, order = normal(16, data.y.shape[1], 4, seed=6), torch.arange(16)
-    same(lambda: list(find_change_point(effects, data.process(scales), order, 3)))
+    same(lambda: [change_row(effects, data.process(scales), order)])
+    same(lambda: [one.size for one in findings(changes_of(data), data.process(scales), order)])
 
 
 def test_the_choice_of_scales(measured: Measured) -> None:

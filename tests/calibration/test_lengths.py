@@ -62,10 +62,10 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
     q, y = ARM.measure(ROWS, seed=1)
     found = clean()[0].lengths[0]
-    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed[0] - found.value)))
+    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
     assert bool(texts) == noticed
-    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed[0]
-    assert found.unnoticed[1] * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
+    assert found.unnoticed * found.motion * 3**0.5 == pytest.approx(float(moved), rel=0.15)
     assert "may be wrong without a warning" in str(wrong.lengths[0])
 
 
@@ -103,7 +103,7 @@ def test_what_a_camera_is_said_to_hold() -> None:
     data = readings(ARM, "image", 24)
     points = ARM.nominal(data.q)[:, :3, 3]
     cameras = Cameras.at(data, points)
-    found = {effect.name: effect.motion[..., 0] for effect in cameras.doubts(points, data.device)}
+    found = {one.name: one.effects[..., 0] for one in cameras.hypotheses(points, data.device) if one.said}
     image = cameras.observation(data.device).value(points)
     assert len(found) == 9
     focal = sum(motion for name, motion in found.items() if name.startswith("the focal length"))

@@ -16,9 +16,12 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import causes_of, chance_of_jump, find_change_point, findings
+from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
+from diffeo_calib.calibration.diagnostics.hypotheses import opened
+from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, changes_of, findings
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.sensors.devices import Hypothesis
 
 MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
 
@@ -70,17 +73,29 @@ def test_the_gain_is_that_of_the_definition() -> None:
     data, effects = setting.tangent_data, normal(24, 3, 4, seed=0)
     order = torch.from_numpy(np.random.default_rng(1).permutation(24))
     inverse, r = torch.linalg.inv(covariance(data, setting.scales)), data.target.flatten()
-    for fewest in (5, 9):
-        best = find_change_point(effects, data.process(setting.scales), order, fewest)
-        gains = []
-        for row in range(fewest, 24 - fewest + 1):
-            B = torch.zeros(24, 3, 4, dtype=torch.float64)
-            B[order[row:]] = effects[order[row:]]
-            B = B.flatten(0, 1)
-            g, H = B.T @ inverse @ r, B.T @ inverse @ B
-            gains.append(float(g @ torch.linalg.solve(H, g)))
-        assert best.row == fewest + int(np.argmax(gains))
-        assert best.gain == pytest.approx(max(gains), rel=1e-5)
+    gains = []
+    for row in range(CHANGE_ROWS, 24 - CHANGE_ROWS + 1):
+        B = torch.zeros(24, 3, 4, dtype=torch.float64)
+        B[order[row:]] = effects[order[row:]]
+        B = B.flatten(0, 1)
+        g, H = B.T @ inverse @ r, B.T @ inverse @ B
+        gains.append(float(g @ torch.linalg.solve(H, g)))
+    jump, _ = findings([Hypothesis("any", effects)], data.process(setting.scales), order)
+    assert jump.row == CHANGE_ROWS + int(np.argmax(gains))
+    left = (float(r @ inverse @ r) - max(gains)) / len(r)
+    assert jump.gain == pytest.approx(max(gains) / max(1.0, left), rel=1e-5)
+
+
+def test_what_was_opened_explains_any_size() -> None:
+    """Hardly anything of the effects is left in K^-1."""
+    arm, measurements, _ = simulated(24)
+    setting = Setting(arm.nominal, measurements)
+    process = setting.tangent_data.process(setting.scales)
+    E = process.numbers.of_table(normal(24, 3, 2, seed=1))
+    inverse, other = process.inverse, opened(process, E)
+    left = inverse - inverse @ E @ torch.linalg.solve(E.T @ inverse @ E, E.T @ inverse)
+    assert_close(other.inverse, left, rtol=0, atol=1e-4 * float(inverse.max()))
+    assert float((E.T @ other.mu).abs().max()) < 1e-3 * float((E.T @ process.mu).abs().max())
 
 
 def test_errors_that_the_scales_understate_are_no_evidence() -> None:
@@ -90,8 +105,8 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
 
     def gains(factor: float) -> Tensor:
         moved = data.with_measured(data.y + (factor - 1.0) * data.target)
-        found = findings(causes_of(data), moved.process(setting.scales), order)
-        return torch.tensor([one.point.gain for one in found], dtype=torch.float64)
+        found = findings(changes_of(data), moved.process(setting.scales), order)
+        return torch.tensor([one.gain for one in found], dtype=torch.float64)
 
     assert_close(gains(1000.0), gains(100.0), rtol=1e-6, atol=0)
     assert float((gains(1e-2) / gains(100.0)).max()) < 0.1

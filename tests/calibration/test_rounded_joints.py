@@ -10,7 +10,8 @@ import torch
 from product_bank import Case, simulated
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.campaign import RoundingLimits, quantum, warn_of_rounding
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.campaign import quantum, warn_of_rounding
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
@@ -52,10 +53,12 @@ def test_values_commanded_with_few_digits_are_right(arm: Case) -> None:
         warn_of_rounding(arm.robot, rounded(arm, 1e-6), tangent, arm.result.leave_one_out)  # or far smaller ones
 
 
-def test_few_rows_do_not_tell(arm: Case) -> None:
+def test_few_rows_do_not_tell(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their errors are as large as those of rounding, whatever the digits."""
-    data, whatever = rounded(arm, 1e-3), RoundingLimits(least=0.0, most=math.inf)
-    judged = place(arm.robot, arm.train, silent).tangent_data(), arm.result.leave_one_out, whatever
+    monkeypatch.setattr(gates, "ROUNDING_LEAST", 0.0)
+    monkeypatch.setattr(gates, "ROUNDING_MOST", math.inf)
+    data = rounded(arm, 1e-3)
+    judged = place(arm.robot, arm.train, silent).tangent_data(), arm.result.leave_one_out
     with pytest.warns(DiffeoCalibWarning, match="are rounded to"):
         warn_of_rounding(arm.robot, data, *judged)
     warn_of_rounding(arm.robot, data.rows(slice(15)), *judged)  # a warning fails this test

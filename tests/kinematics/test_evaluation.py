@@ -220,9 +220,9 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
     text = implausible(arm.model, moved, errors) or ""
     assert text.startswith("these errors are not those of a calibrated robot: expected a median of about ")
     assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
-    assert not impossible(arm.model, errors)
+    assert not impossible(arm.model, errors.median)
     far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
-    assert impossible(arm.model, dc.evaluate(arm.model.__call__, far))
+    assert impossible(arm.model, dc.evaluate(arm.model.__call__, far).median)
     with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--register"):
         dc.evaluate(arm.model, far)
 

@@ -34,13 +34,13 @@ def test_from_a_line_on(first: int, lag: int) -> None:
     there = 40 - first - 2 * max(lag, 0)  # the last rows have lost their measured values
     assert there - 2 <= step.rows <= there
     where = f"{abs(lag)} line{'s' * (abs(lag) > 1)} {'above' if lag < 0 else 'below'}"
-    assert step.sentence == f"from line {first + 2} on the measured values belong to the joints {where}"
+    assert step.words == f"from line {first + 2} on the measured values belong to the joints {where}"
 
 
 def test_a_block_in_the_middle() -> None:
     (step,) = out_of_step(*table(40, 10, 22, -1), typical=TYPICAL)
     assert (step.first, step.last, step.lag, step.to_the_end) == (12, 23, -1, False)
-    assert step.sentence.startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
+    assert step.words.startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
 
 
 def test_rows_in_any_order_and_with_gaps() -> None:

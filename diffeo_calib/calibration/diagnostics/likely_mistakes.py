@@ -8,7 +8,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from itertools import combinations, product
 from math import pi
@@ -17,9 +17,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, InputError, sentence, shown, warn_user
+from diffeo_calib.common.errors import (
+    LONGEST_NAME,
+    DiffeoCalibError,
+    InputError,
+    MeasurementError,
+    sentence,
+    shown,
+    warn_user,
+)
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
@@ -49,10 +58,15 @@ class Reading:
     robot: Tree
     q: Tensor
     points: Tensor
-    words: str
+    words: str = ""
     option: str = ""
     partial: bool = False
     on: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, robot: Tree, data: Measurements) -> Reading:
+        """Measurements as they are."""
+        return cls(robot, data.q, data.points, on=data.on or ())
 
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
@@ -66,19 +80,19 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     columns, table = rotations.numeric_table(data)
     if columns is None:
         return
-    spare = _spare(columns, table)
+    spare, as_read = _spare(columns, table), Reading.of(robot, data)
     for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints, strict=True)):
         for name in _similar([joint, own], spare):
             q = data.q.clone()
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
             words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
-            yield Reading(robot, q, data.points, words, on=data.on or ())
+            yield replace(as_read, q=q, words=words)
     for marker, triple in enumerate(columns.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
                 points = rotations.with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
-                yield Reading(robot, data.q, points, words, on=data.on or ())
+                yield replace(as_read, points=points, words=words)
 
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
@@ -127,30 +141,6 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
     return values.deg2rad() if columns.table.angle == "deg" else values
 
 
-@dataclass(frozen=True)
-class MistakeLimits:
-    """When a mistake counts as found.
-
-    Args:
-        remaining: largest part of the residual that may remain after its correction. usual: largest residual, relative
-            to the spread of the points; right readings leave 0.001 to 0.01, and one of two mistakes undone 0.1.
-        decisive: part of the residual below which no other mistake is tried.
-        rows: largest number of rows that are registered.
-        below_tip: part of the residual that a joint below the tip must leave to be warned about; a joint that does not
-            move the markers leaves more than all of it.
-        told_apart: residual, as a multiple of the best one, from which a reading of rotations counts as worse. The best
-            residual is the robot's own error e; a wrong reading adds its w to it, sqrt(e^2 + w^2).
-    """
-
-    remaining: float = 0.2
-    usual: float = 0.03
-    decisive: float = 0.02
-    rows: int = 60
-    below_tip: float = 0.8
-    told_apart: float = 3.0
-
-
-LIMITS = MistakeLimits()
 RIGHT_ANGLES = ((pi / 2, "90"), (-pi / 2, "-90"), (pi, "180"))
 """Usual joint offsets of another convention [rad, deg]."""
 NO_MISTAKE_FOUND = (
@@ -169,30 +159,29 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
         a phrase: the mistake that explains them; empty if there is none.
     """
     good: list[tuple[float, Reading]] = []
-    for group in (
-        _other_lengths,
-        _shifted,
-        _mirrored,
-        _other_tips,
-        other_rotations,
-        _other_joints,
-        longer_chains,
-        other_columns,
-    ):
+    for group in (_other_points, other_rotations, _other_joints, longer_chains, other_columns):
         for reading in group(robot, data):
             residual = _residual(reading)
-            if residual < min(LIMITS.remaining * typical, LIMITS.usual * spread(reading.points)):
+            if residual < min(gates.OTHER_READING_LEFT * typical, gates.RIGHT_READING * spread(reading.points)):
                 good.append((residual, reading))
-            if residual < LIMITS.decisive * typical and group is not other_rotations:
+            if residual < gates.DECISIVE_READING * typical and group is not other_rotations:
                 break  # conventions may be hard to tell apart: all of them are tried
-        if any(residual < LIMITS.decisive * typical or reading.partial for residual, reading in good):
+        if any(residual < gates.DECISIVE_READING * typical or reading.partial for residual, reading in good):
             break
     return _advice(good, typical) if good else ""
 
 
+def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwise: str | None = None) -> None:
+    """Refuse measurements that a mistake explains; else warn of them and advise ``otherwise``, if that is given."""
+    if mistake:
+        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
+    if otherwise is not None:
+        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
+
+
 def residual_of(robot: Tree, data: Measurements) -> float:
     """Median residual of a registration of the measurements as they are, m; infinite if the rows are too few."""
-    return _residual(Reading(robot, data.q, data.points, "", on=data.on or ()))
+    return _residual(Reading.of(robot, data))
 
 
 def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:
@@ -204,7 +193,7 @@ def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:
     if not longer:
         return
     (best, reading), own = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
-    if best < LIMITS.below_tip * own:
+    if best < gates.JOINT_BELOW_TIP * own:
         got = f"a median residual that falls from {1e3 * own:.3g} to {1e3 * best:.3g} mm with it"
         warn_user(sentence("a joint below the tip seems to move the markers", got=got, fix=reading.words))
 
@@ -216,7 +205,7 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
     words, doubt = reading.words, ""
     if reading.option:
         near = sorted(entry for entry in ((r, one.option) for r, one in whole) if entry[1])
-        options = [option for residual, option in near if residual < LIMITS.told_apart * best]
+        options = [option for residual, option in near if residual < gates.READINGS_TOLD_APART * best]
         words = f"the rotations seem to be written with {' or '.join(options)}"
         doubt = ", which these rows do not tell apart" if len(options) > 1 else ""
     return f"{words}{doubt} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
@@ -225,7 +214,7 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
 def _residual(reading: Reading) -> float:
     """Median distance after registration of a random subset of the rows, m; infinite if that cannot be done."""
     q, points = reading.q, reading.points
-    rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: LIMITS.rows]
+    rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: gates.REGISTERED_ROWS]
     if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return torch.inf
     try:
@@ -235,42 +224,29 @@ def _residual(reading: Reading) -> float:
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
 
 
-def _other_lengths(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Positions in another unit; the points of a pose stay where they are beside its origin."""
-    bodies = data.points.unflatten(1, (data.origins.shape[1], -1))
-    for factor, words in ((1e3, "small"), (1e-3, "large")):
-        points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)
-        said = f"the positions seem to be 1000 times too {words}: check their unit (`length`, mm or m)"
-        yield Reading(robot, data.q, points, said, on=data.on or ())
-
-
-def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Points that belong to the row before or after."""
-    pair = "pair every configuration with its own"
-    words, on = f"the points seem to be one row too {{}}: {pair}", data.on or ()
-    yield Reading(robot, data.q[:-1], data.points[1:], words.format("late"), on=on)
-    yield Reading(robot, data.q[1:], data.points[:-1], words.format("early"), on=on)
-
-
-def _mirrored(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Points in a frame of the other hand."""
+def _other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Points in another unit, of the row before or after, in a frame of the other hand, or of exchanged tips."""
+    own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
+    for factor, size in ((1e3, "small"), (1e-3, "large")):
+        points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
+        words = f"the positions seem to be 1000 times too {size}: check their unit (`length`, mm or m)"
+        yield replace(own, points=points, words=words)
+    words = "the points seem to be one row too {}: pair every configuration with its own"
+    yield replace(own, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
+    yield replace(own, q=data.q[1:], points=data.points[:-1], words=words.format("early"))
     words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
     for mirrored in data.bodies.mirrored(data):
-        yield Reading(robot, data.q, mirrored, words, on=data.on or ())
-
-
-def _other_tips(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Markers of two tips exchanged, such as those of the left and of the right hand."""
+        yield replace(own, points=mirrored, words=words)
     for one, other in combinations(robot.tips, 2):
         exchanged = {one: other, other: one}
         words = f"the markers on '{one}' and '{other}' seem to be exchanged: check which columns belong to which tip"
-        yield Reading(robot, data.q, data.points, words, on=tuple(exchanged.get(tip, tip) for tip in data.on or ()))
+        yield replace(own, words=words, on=tuple(exchanged.get(tip, tip) for tip in own.on))
 
 
 def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values with one mistake undone."""
-    for q, words in corrections_of_joints(robot, data):
-        yield Reading(robot, q, data.points, words, on=data.on or ())
+    own = Reading.of(robot, data)
+    return (replace(own, q=q, words=words) for q, words in corrections_of_joints(robot, data))
 
 
 def corrections_of_angles(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]]:
@@ -287,14 +263,16 @@ def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Ten
     for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
         q = torch.where(turning, data.q, factor * data.q)
         yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
+
+    def changed(k: int, factor: float = 1.0, offset: float = 0.0) -> Tensor:
+        q = data.q.clone()
+        q[:, k] = factor * q[:, k] + offset
+        return q
+
     for k, name in enumerate(names):
-        tried = [(-1.0, f"{name} seems to count the other way: change the sign of its column, or of its axis")]
+        yield changed(k, -1.0), f"{name} seems to count the other way: change the sign of its column, or of its axis"
         for factor, words in ANGLE_MISTAKES if robot.periodic[k] else ():
-            tried.append((factor, f"the values of {name} seem to be {words}; check its unit"))
-        for factor, words in tried:
-            q = data.q.clone()
-            q[:, k] *= factor
-            yield q, words
+            yield changed(k, factor), f"the values of {name} seem to be {words}; check its unit"
     for a, b in combinations(range(len(names)), 2):
         q = data.q.clone()
         q[:, [a, b]] = data.q[:, [b, a]]
@@ -302,6 +280,5 @@ def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Ten
     # Last: half a turn of one joint may look like another one that counts the other way.
     for k, (offset, degrees) in product(range(len(names)), RIGHT_ANGLES):
         if robot.periodic[k]:
-            q = data.q.clone()
-            q[:, k] += offset
-            yield q, f"{names[k]} seems to have another offset: its values fit with {degrees} degrees added"
+            words = f"{names[k]} seems to have another offset: its values fit with {degrees} degrees added"
+            yield changed(k, offset=offset), words

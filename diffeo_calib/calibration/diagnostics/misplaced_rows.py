@@ -7,14 +7,13 @@ better its lag fits, and every change of the lag costs as much as a few rows tha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     ROBUST,
@@ -23,34 +22,12 @@ from diffeo_calib.calibration.identification.registration import (
     register,
     spread,
 )
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import MeasurementError, sentence
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-
-
-@dataclass(frozen=True)
-class StepLimits:
-    """When rows count as out of step.
-
-    Args:
-        largest_lag: largest number of lines between measured values and their joints.
-        change_cost: cost of a change of the lag, in rows that fit nowhere.
-        near: number of typical distances within which a lag fits. gross: from which the row's own joints do not fit.
-        fewest_rows: rows that fit at a lag and do not fit their own joints. fitting: smallest share of a run that fits.
-    """
-
-    largest_lag: int = 5
-    change_cost: float = 3.0
-    near: float = 3.0
-    gross: float = 10.0
-    fewest_rows: int = 3
-    fitting: float = 0.8
-
-
-STEP_LIMITS = StepLimits()
 
 
 class Step(NamedTuple):
@@ -68,37 +45,45 @@ class Step(NamedTuple):
     rows: int
 
     @property
-    def sentence(self) -> str:
+    def words(self) -> str:
         """Such as ``from line 32 on the measured values belong to the joints 1 line above``."""
         where = f"from line {self.first} on" if self.to_the_end else f"in lines {self.first} to {self.last}"
         count = f"{abs(self.lag)} line{'s' * (abs(self.lag) > 1)}"
         return f"{where} the measured values belong to the joints {count} {'above' if self.lag < 0 else 'below'}"
 
+    def sentence(self, before: str = "", after: str = "") -> str:
+        """What is wrong, between some words, and what to do."""
+        return sentence(
+            f"{before}{self.words}{after}",
+            got=f"{self.rows} rows that fit there, and not at their own joints",
+            fix="pair every configuration with its own measured values: was a line lost or doubled there?",
+        )
 
-def out_of_step(
-    predicted: Tensor, measured: Tensor, line_numbers: Tensor, typical: float, limits: StepLimits = STEP_LIMITS
-) -> list[Step]:
+
+def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typical: float) -> list[Step]:
     """Runs of rows whose measured values belong to the joints of other lines, in the order of their lines.
 
     Args:
         predicted: (N, P, 3) markers at the joints of every row, m. measured: (N, P, 3) m, NaN where hidden.
         line_numbers: (N,) distinct numbers; rows may be missing.
         typical: typical distance of rows that are right, m.
-        limits: when rows count as out of step.
     """
     order = line_numbers.argsort()
     lines, predicted, measured = line_numbers[order], predicted[order], measured[order]
-    distances = _distances(predicted, measured, lines, limits.largest_lag)  # (lags, N)
-    costs = (distances / (limits.near * typical)).square().clamp(max=1.0).nan_to_num(1.0)
-    path = _cheapest_path(costs, limits.change_cost)
-    own = distances[limits.largest_lag]
-    steps = []
-    for start, end in _runs(path):
-        fits = distances[path[start], start:end] <= limits.near * typical
-        paired = int((~distances[path[start], start:end].isnan()).sum())
-        moved = fits & (own[start:end] > limits.gross * typical)
-        lag = path[start] - limits.largest_lag
-        if lag and int(moved.sum()) >= limits.fewest_rows and int(fits.sum()) >= limits.fitting * paired:
+    distances = measured.new_full((2 * gates.LARGEST_LAG + 1, len(lines)), torch.nan)  # to the joints at every lag
+    for number, each in enumerate(distances):
+        rows, others = paired(lines, number - gates.LARGEST_LAG)
+        each[rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
+    costs = (distances / (gates.LAG_NEAR * typical)).square().clamp(max=1.0).nan_to_num(1.0)
+    path = _cheapest_path(costs, gates.LAG_CHANGE_COST)
+    own, steps = distances[gates.LARGEST_LAG], []
+    starts = [row for row in range(len(path)) if row == 0 or path[row] != path[row - 1]]
+    for start, end in zip(starts, [*starts[1:], len(path)], strict=True):
+        fits = distances[path[start], start:end] <= gates.LAG_NEAR * typical
+        known = int((~distances[path[start], start:end].isnan()).sum())
+        moved = fits & (own[start:end] > gates.LAG_GROSS * typical)
+        lag = path[start] - gates.LARGEST_LAG
+        if lag and int(moved.sum()) >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * known:
             place = int(lines[start]), int(lines[end - 1])
             steps.append(Step(*place, lag, end == len(lines), int(moved.sum())))
     return steps
@@ -116,15 +101,6 @@ def paired(line_numbers: Tensor, lag: int) -> tuple[Tensor, Tensor]:
     return rows, at[rows]
 
 
-def _distances(predicted: Tensor, measured: Tensor, lines: Tensor, largest: int) -> Tensor:
-    """Of every row to the prediction of the joints at every lag: (2 largest + 1, N) m, NaN where there are none."""
-    table = measured.new_full((2 * largest + 1, len(lines)), torch.nan)
-    for lag in range(-largest, largest + 1):
-        rows, others = paired(lines, lag)
-        table[lag + largest, rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
-    return table
-
-
 def _cheapest_path(costs: Tensor, change_cost: float) -> list[int]:
     """The state of every row that minimises the sum of its costs (states, N) and of the changes: N states."""
     total, before = costs[:, 0], []
@@ -137,30 +113,6 @@ def _cheapest_path(costs: Tensor, change_cost: float) -> list[int]:
     for previous in reversed(before):
         path.append(int(previous[path[-1]]))
     return path[::-1]
-
-
-def _runs(path: list[int]) -> list[tuple[int, int]]:
-    """First and last + 1 of the rows with equal states."""
-    starts = [row for row in range(len(path)) if row == 0 or path[row] != path[row - 1]]
-    return list(zip(starts, [*starts[1:], len(path)], strict=True))
-
-
-@dataclass(frozen=True)
-class WindowLimits:
-    """Consecutive rows that are registered on their own where the table as a whole fits nowhere.
-
-    Args:
-        parts: the table is cut into 2, 3, ... windows of equal length.
-        fewest_rows: smallest number of rows of a window.
-        lags: tried in this order; lines between the measured values of a window and their joints.
-    """
-
-    parts: tuple[int, ...] = (2, 3, 4)
-    fewest_rows: int = 10
-    lags: tuple[int, ...] = (0, -1, 1, -2, 2)
-
-
-LIMITS = WindowLimits()
 
 
 def check_row_order(robot: Tree, data: Measurements, registration: Identification) -> None:
@@ -179,7 +131,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     geometry: Geometry | None = registration.geometry
     if typical > ROBUST.consistent_residual * spread(data.points):
         geometry, typical = _window(robot, data)
-    elif int((own > STEP_LIMITS.gross * typical).sum()) < STEP_LIMITS.fewest_rows:
+    elif int((own > gates.LAG_GROSS * typical).sum()) < gates.LAG_ROWS:
         return
     if geometry is None:
         return
@@ -190,17 +142,13 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     if not steps or (steps[0].to_the_end and steps[0].first == int(data.line_numbers.min())):
         return
     more = f" (and {len(steps) - 1} more such block{'s' * (len(steps) > 2)})" * (len(steps) > 1)
-    raise MeasurementError.of(
-        f"the measurements do not fit this robot: {steps[0].sentence}{more}",
-        got=f"{steps[0].rows} rows that fit there, and not at their own joints",
-        fix="pair every configuration with its own measured values: was a line lost or doubled there?",
-    )
+    raise MeasurementError(steps[0].sentence("the measurements do not fit this robot: ", more))
 
 
 def _refined(robot: Tree, data: Measurements, geometry: Geometry, typical: float) -> tuple[Geometry, float]:
     """The registration of all rows that fit their own joints, and their median distance, m, if they are enough."""
-    near = largest_distances(geometry, data) <= STEP_LIMITS.gross * typical
-    if int(near.sum()) < LIMITS.fewest_rows or not can_register(data.points[near]):
+    near = largest_distances(geometry, data) <= gates.LAG_GROSS * typical
+    if int(near.sum()) < gates.WINDOW_ROWS or not can_register(data.points[near]):
         return geometry, typical
     again = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
     return again, float(largest_distances(again, data)[near].median())
@@ -209,9 +157,11 @@ def _refined(robot: Tree, data: Measurements, geometry: Geometry, typical: float
 def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
     """The first registration of consecutive rows that is consistent, and its median distance, m; None if none is."""
     limit = ROBUST.consistent_residual * spread(data.points)
-    for lag, rows in product(LIMITS.lags, _windows(data)):
+    order = data.line_numbers.argsort().to(data.q.device)
+    windows = [rows for parts in gates.WINDOW_PARTS for rows in order.tensor_split(parts)]
+    for lag, rows in product(gates.WINDOW_LAGS, windows):
         own, other = paired(data.line_numbers[rows], lag)
-        if len(own) < LIMITS.fewest_rows:
+        if len(own) < gates.WINDOW_ROWS:
             continue
         q, points = data.q[rows][other], data.points[rows][own]
         if not can_register(points):
@@ -221,10 +171,3 @@ def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
         if typical <= limit:
             return geometry, typical
     return None, torch.inf
-
-
-def _windows(data: Measurements) -> Iterator[Tensor]:
-    """Row numbers of every window, in the order of their lines."""
-    order = data.line_numbers.argsort().to(data.q.device)
-    for parts in LIMITS.parts:
-        yield from order.tensor_split(parts)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import NO_MISTAKE_FOUND, likely_mistake
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.likely_mistakes import NO_MISTAKE_FOUND, likely_mistake, refuse_or_warn
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
@@ -27,41 +27,6 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import joint_name_fix
 
 
-@dataclass(frozen=True)
-class PlausibilityLimits:
-    """Limits beyond which measurements are doubted: refused if another reading explains them, else warned about.
-
-    A relative residual is a median distance divided by the spread of the markers.
-
-    Args:
-        never_moved_m: spread of the markers below which they stand still: no device of robots repeats so well.
-        registration_residual: relative residual after registration. geometric_residual: after the geometric
-            calibration; a UR10 leaves 0.001, a wrong tip link 0.1. unexplained_residual: the same, from which it is
-            warned about without another reading; noise of 1 % of the reach leaves 0.03.
-        fixed_range: range of a joint, rad or strokes of at most 1 m, below which it never moved. small_range: below
-            which it hardly moved.
-        orientation_rad: largest plausible orientation error after the geometric calibration.
-        orientation_share: share of poses that may exceed it.
-        limit_excess: part of a joint's range by which its values may exceed its limits; robot files are often
-            careless.
-        gross_share: largest share of outliers.
-    """
-
-    never_moved_m: float = 1e-6
-    registration_residual: float = 0.25
-    geometric_residual: float = 0.02
-    unexplained_residual: float = 0.05
-    fixed_range: float = 1e-3
-    small_range: float = 0.05
-    orientation_rad: float = 0.1
-    orientation_share: float = 0.1
-    limit_excess: float = 0.25
-    gross_share: float = 0.4
-
-
-LIMITS = PlausibilityLimits()
-
-
 def check_joints(robot: Tree, data: Any) -> None:
     """Refuse joints that are not the robot's; warn of joints that never or hardly move."""
     _check_names(robot, data)
@@ -70,11 +35,11 @@ def check_joints(robot: Tree, data: Any) -> None:
     low, high = robot.limits.to(data.q.device).unbind(1)
     turns, strokes = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device), (high - low).clamp(max=1.0)
     ranges = (data.q.amax(0) - data.q.amin(0)) / torch.where(turns | (strokes <= 0), 1.0, strokes)
-    still = ranges < LIMITS.fixed_range
+    still = ranges < gates.FIXED_RANGE
     if bool(still.all()):
         what = f"all {len(data)} rows hold the same configuration: the robot does not move"
         raise MeasurementError.of(what, fix="measure poses in which every joint moves")
-    hardly = (ranges < LIMITS.small_range) & ~still
+    hardly = (ranges < gates.SMALL_RANGE) & ~still
     for flags, words in ((still, "never moved"), (hardly, "hardly moved")):
         if bool(flags.any()):
             names = ", ".join(name for name, flag in zip(robot.joint_names, flags, strict=True) if flag)
@@ -109,7 +74,7 @@ def check_limits(robot: Tree, data: Any) -> None:
     turns = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     away = data.q - (low + high) / 2
     q = torch.where(turns, data.q - 2 * math.pi * (away / (2 * math.pi)).round(), data.q)
-    least, most, margin = q.amin(0), q.amax(0), LIMITS.limit_excess * (high - low)
+    least, most, margin = q.amin(0), q.amax(0), gates.LIMIT_EXCESS * (high - low)
     beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
     beyond = beyond & ~(turns & (data.q.abs().amax(0) > LARGEST_JOINT_ANGLE_RAD))
     for kind, unit, other in ((turns, "rad", "degrees"), (~turns, "m", "millimetres")):
@@ -156,23 +121,23 @@ def check_identification(data: Measurements, identification: Identification) -> 
     """
     size, typical = spread(data.points), _typical(identification, data)
     angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
-    if len(angles) and float((angles > LIMITS.orientation_rad).double().mean()) > LIMITS.orientation_share:
+    if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:
         what = "measured orientations"
-        expected = f"errors well below {math.degrees(LIMITS.orientation_rad):.0f} degrees"
+        expected = f"errors well below {math.degrees(gates.ORIENTATION_RAD):.0f} degrees"
         got = f"a median of {math.degrees(float(angles.median())):.3g} degrees"
-    elif typical > LIMITS.geometric_residual * size:
+    elif typical > gates.GEOMETRIC_RESIDUAL * size:
         what, got = "measurements", f"a median of {typical:.3g} m"
         expected = f"residuals well below the points' spread of {size:.3g} m"
     else:
         return
-    mistake = likely_mistake(identification.geometry.chain, data, typical)
-    if not mistake and what == "measurements" and typical < LIMITS.unexplained_residual * size:
-        return
-    what, fix = f"the {what} do not fit this robot, even with geometric errors", mistake or NO_MISTAKE_FOUND
-    text = sentence(what, expected=expected, got=got, fix=fix)
-    if mistake:
-        raise MeasurementError(text)
-    warn_user(text)
+    doubtful = what == "measured orientations" or typical >= gates.UNEXPLAINED_RESIDUAL * size
+    refuse_or_warn(
+        f"the {what} do not fit this robot, even with geometric errors",
+        expected=expected,
+        got=got,
+        mistake=likely_mistake(identification.geometry.chain, data, typical),
+        otherwise=NO_MISTAKE_FOUND if doubtful else None,
+    )
 
 
 def _typical(identification: Identification, data: Measurements) -> float:
@@ -183,7 +148,7 @@ def _typical(identification: Identification, data: Measurements) -> float:
 def _check_motion(robot: Tree, data: Measurements) -> None:
     """Refuse markers that never move, although the robot's tip does: they determine nothing."""
     measured, tips = spread(data.points), spread(robot.tip_poses(data.q)[..., :3, 3])
-    if tips > 0 and measured < LIMITS.never_moved_m:
+    if tips > 0 and measured < gates.NEVER_MOVED_M:
         raise MeasurementError.of(
             "the measured points never move, and so tell nothing about the robot",
             expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
@@ -197,38 +162,13 @@ def _check_registration(robot: Tree, data: Measurements, registration: Identific
     """Refuse measurements that no base and markers explain, but another reading does."""
     measured, nominal = spread(data.points), spread(registration.geometry.points(data.q))
     typical = _typical(registration, data)
-    doubted = typical > LIMITS.registration_residual * max(measured, nominal)
-    mistake = likely_mistake(robot, data, typical) if doubted else ""
-    if mistake:
-        raise MeasurementError.of(
+    if typical > gates.REGISTERED_RESIDUAL * max(measured, nominal):
+        refuse_or_warn(
             "the measurements do not fit this robot: no base frame and markers explain them",
             expected=f"residuals well below the points' spread of {measured:.3g} m",
             got=f"a median of {typical:.3g} m",
-            fix=mistake,
+            mistake=likely_mistake(robot, data, typical),
         )
-
-
-@dataclass(frozen=True)
-class NominalLimits:
-    """When rows may be the nominal robot's own, as its controller or a program computes them.
-
-    Args:
-        exact_share: residual after registration, in the extent of the measured values, that no device leaves.
-        share: residual, in that extent, from which errors of a robot show.
-        ratio: residual of the registration, in that of the geometric calibration, up to which errors of links explain
-            nothing.
-        overdetermined: measured coordinates per unknown from which residuals tell something.
-        fewest_joints: of robots whose errors base and marker cannot absorb.
-    """
-
-    exact_share: float = 1e-6
-    share: float = 1e-4
-    ratio: float = 1.15
-    overdetermined: float = 3.0
-    fewest_joints: int = 3
-
-
-NOMINAL = NominalLimits()
 
 
 def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identification, found: Identification) -> None:
@@ -242,11 +182,11 @@ def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identificati
     predicted = points if data.observe is None else data.observe.value(points)
     rms = float((data.y - predicted)[data.visible].square().mean().sqrt())
     size = float((data.y - data.y.mean(0)).abs().amax())  # the reach of a robot with prismatic joints may have no bound
-    slices, count = data.nominal.geometry.slices, NOMINAL.overdetermined
+    slices, count = data.nominal.geometry.slices, gates.NOMINAL_OVERDETERMINED
     placed = sum(slices[name].stop - slices[name].start for name in ("base", "tool"))
-    exact = rms < NOMINAL.exact_share * size and data.coordinates > count * placed
-    shown = registration.noise > min(NOMINAL.ratio * found.noise, NOMINAL.share * size)
-    enough = robot.n >= NOMINAL.fewest_joints and data.coordinates > count * data.nominal.geometry.size
+    exact = rms < gates.EXACT_SHARE * size and data.coordinates > count * placed
+    shown = registration.noise > min(gates.NOMINAL_RATIO * found.noise, gates.NOMINAL_SHARE * size)
+    enough = robot.n >= gates.NOMINAL_JOINTS and data.coordinates > count * data.nominal.geometry.size
     if exact or (enough and not shown):
         what = f"these rows show no errors of the robot: its description explains them to {1e3 * rms:.2g} mm RMS"
         what += ", and errors of its links explain no more"

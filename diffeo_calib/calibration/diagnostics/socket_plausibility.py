@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.campaign import LIMITS as PATH_LIMITS
-from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS as MISTAKES
-from diffeo_calib.calibration.diagnostics.likely_mistakes import corrections_of_angles, corrections_of_joints
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    corrections_of_angles,
+    corrections_of_joints,
+    refuse_or_warn,
+)
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     SocketRegistration,
@@ -19,6 +21,7 @@ from diffeo_calib.calibration.identification.registration import (
     socket_means,
     spread,
 )
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -35,26 +38,8 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, check_devices
 from diffeo_calib.sensors.tables import sees_frame
 
-
-@dataclass(frozen=True)
-class ReadingLimits:
-    """When readings are refused or warned about.
-
-    Args:
-        fewest_rows: below which single numbers say too little: a robot of six joints has some thirty geometric errors.
-        unseen: motion of a reading, relative to that of a coordinate of the ball, below which it does not show a joint.
-        tilted: motion of the readings per unit of the ball's offset, by turns of the tool, below which its place is not
-            determined along that direction.
-        size_share: share of the expected error from which the robot's size is warned about.
-    """
-
-    fewest_rows: int = 40
-    unseen: float = 0.05
-    tilted: float = 0.05
-    size_share: float = 0.8
-
-
-READING_LIMITS = ReadingLimits()
+TILT = "tilt the tool by 20 degrees or more, to several sides"
+STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
 
 def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> None:
@@ -73,29 +58,37 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
     if tip is not None and tip not in robot.tips:
         raise InputError.of("the tip of the readings", expected=few(robot.tips), got=tip)
     count = sum(map(len, tables))
-    if alone and count < READING_LIMITS.fewest_rows:
+    if alone and count < gates.READING_ROWS:
         fix = "measure more rows, better 150, or hold out fewer of them (--holdout)"
-        expected = f"at least {READING_LIMITS.fewest_rows} rows"
+        expected = f"at least {gates.READING_ROWS} rows"
         raise MeasurementError.of("`readings`", expected=expected, got=count, fix=fix)
     for table in tables:
         check_devices(table)
 
 
-def warn_of_what_is_open(devices: Sequence[Devices], shown: dict[str, float], tilt: Tensor) -> None:
-    """Warn of directions of the ball and joints that no reading shows.
+def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
+    """Warn of directions of the ball and joints that rows which tell no coordinates do not show.
 
     Args:
-        devices: where readings were found to come from.
-        shown: joint -> motion of the readings with it, relative to that of a coordinate of the ball.
-        tilt: (3,) motions of the readings per unit of the ball's offset, by turns of the tool alone.
+        data: the rows around the geometric calibration. devices: where readings were found to come from.
     """
+    if data.shared is None:
+        return
+    whole = data.nominal.jacobian(data.x, data.theta)
+    shown = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
+    by_ball = data.sensitivities[..., data.nominal.geometry.slices["tool"]].flatten(0, 1)
+    shared = data.shared.flatten(0, 1)
+    shared = shared / shared.norm(dim=0).clamp(min=1e-12)
+    known = torch.linalg.lstsq(shared, by_ball, rcond=1e-6, driver="gelsd").solution  # moved devices do as well
+    tilt = torch.linalg.svdvals(by_ball - shared @ known) / data.coordinates**0.5
     for own in devices:
         for what, fix in own.open_sentences():
             warn_user(sentence(what, fix=fix))
-    if float(tilt.min()) < READING_LIMITS.tilted:
+    if float(tilt.min()) < gates.TILTED:
         what = "the tool is hardly tilted: where the ball is on it, along one direction, is not determined"
-        warn_user(sentence(what, fix="tilt the tool by 20 degrees or more, to several sides"))
-    unseen = [name for name, share in shown.items() if share < READING_LIMITS.unseen]
+        warn_user(sentence(what, fix=TILT))
+    names = data.nominal.geometry.chain.joint_names
+    unseen = [name for name, share in zip(names, shown.tolist(), strict=True) if share < gates.UNSEEN]
     if unseen:
         what = f"the readings hardly change with {few(unseen)}: errors of such joints are not determined"
         warn_user(sentence(what, fix="add devices that see these joints turn"))
@@ -107,7 +100,7 @@ def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:
     Args:
         fix: what to do. size: relative deviation of the size. share: of the expected error. expected: this, m.
     """
-    if share < READING_LIMITS.size_share:
+    if share < gates.SIZE_SHARE:
         return
     what = (
         f"the readings hold too little length: the robot's size is known to {100 * size:.2f} % (one standard "
@@ -115,49 +108,6 @@ def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:
         "robot's description"
     )
     warn_user(sentence(what, fix=fix))
-
-
-@dataclass(frozen=True)
-class SocketLimits:
-    """When rows in sockets are refused or warned about.
-
-    Args:
-        fewest_in_socket: rows of a socket; one says nothing, since its place is not known.
-        surplus: rows beyond the number of sockets that are needed at least.
-        reach_share: median distance of the ball from its socket that is doubted, as a part of the robot's reach.
-        distance_share: relative error of a distance that is doubted, if it also exceeds ``distance_medians`` median
-            distances of the ball from its socket; and its largest relative error in the right unit.
-        turned: motion of the ball per unit of its offset, by turns of the tool in the sockets, below which its place is
-            not determined along any direction. tilted: the same along one direction, which is warned about.
-        wrong_medians: distance from its socket, in medians, from which a row may be in a wrong one. fits: distance from
-            another socket, relative to that, below which it is.
-        wrong_share: share of such rows that is refused.
-        other_residuals: median spread within sockets, in median residuals of measured positions, and other_share: in
-            reaches of the robot, above both of which the rows are not those of one robot. overdetermined: measured
-            coordinates per unknown of base and markers from which residuals are compared.
-    """
-
-    fewest_in_socket: int = 2
-    surplus: int = 6
-    reach_share: float = 0.02
-    distance_share: float = 0.1
-    distance_medians: float = 5.0
-    turned: float = 0.02
-    tilted: float = 0.05
-    wrong_medians: float = 8.0
-    fits: float = 0.3
-    wrong_share: float = 0.25
-    other_residuals: float = 2.5
-    other_share: float = 1e-3
-    overdetermined: float = 2.0
-
-
-LIMITS = SocketLimits()
-RAISED = 0.2
-"""Distance of the new place from the plane, relative to the largest distance of a socket from the base."""
-WORTHWHILE_ERROR_RATIO = 0.8
-"""Expected error with the new place, relative to that without it, below which it is advised."""
-STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
 
 def check_sockets(robot: Tree, data: Measurements) -> None:
@@ -168,12 +118,12 @@ def check_sockets(robot: Tree, data: Measurements) -> None:
     check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
     resting = socket[socket != NO_SOCKET]
     counts = torch.bincount(resting, minlength=len(sockets.names))
-    single = rare_names(data.row_sockets, data.line_numbers.tolist(), LIMITS.fewest_in_socket)
+    single = rare_names(data.row_sockets, data.line_numbers.tolist(), gates.SOCKET_ROWS)
     if single:
-        expected = f"at least {LIMITS.fewest_in_socket} rows in every socket, better 10 or more"
+        expected = f"at least {gates.SOCKET_ROWS} rows in every socket, better 10 or more"
         fix = "check the name, measure more rows there, with the tool turned and tilted otherwise, or leave it out"
         raise MeasurementError.of("rows with sockets", expected=expected, got=few(single), fix=fix)
-    needed = len(counts) + LIMITS.surplus
+    needed = len(counts) + gates.SOCKET_SURPLUS
     if len(resting) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
         raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(resting), fix=fix)
@@ -191,20 +141,23 @@ def check_registration(
         robot: n joints. data: rows in sockets alone. found: their registration. around: the robot as a device saw it.
     """
     median, motion = float(found.distances.median()), _motion(robot, data.q)
-    far = median > LIMITS.reach_share * robot.reach
+    far = median > gates.SOCKET_FAR * robot.reach
     tried = corrections_of_joints(robot, data) if far else corrections_of_angles(robot, data.q)
-    mistake = _mistake(robot, data, median / motion, tried, around)
-    fix = mistake or (
+    best, mistake = min(gates.OTHER_READING_LEFT * median / motion, gates.RIGHT_READING), ""
+    for q, words in tried:
+        again = register_sockets(robot if around is None else around, q, data.socket_numbers)
+        left = float(again.distances.median()) / _motion(robot, q)
+        best, mistake = (left, words) if left < best else (best, mistake)
+    fix = (
         "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the place "
-        "and of the socket in it"
     )
-    what = "these rows do not fit the robot" + ": the ball is in no socket" * far
-    expected = f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves"
-    text = sentence(what, expected=expected, got=f"a median of {1e3 * median:.3g} mm", fix=fix)
-    if mistake:
-        raise MeasurementError(text)
-    if far:
-        warn_user(text)
+    refuse_or_warn(
+        "these rows do not fit the robot" + ": the ball is in no socket" * far,
+        expected=f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves",
+        got=f"a median of {1e3 * median:.3g} mm",
+        mistake=mistake,
+        otherwise=fix + "and of the socket in it" if far else None,
+    )
     _check_tilt(found)
     _check_distances(data, found)
 
@@ -214,33 +167,16 @@ def _motion(robot: Tree, q: Tensor) -> float:
     return max(spread(robot.tip_poses(q)[..., :3, 3]), 1e-9)
 
 
-def _mistake(
-    robot: Tree, data: Measurements, share: float, tried: Iterable[tuple[Tensor, str]], around: Geometry | None
-) -> str:
-    """The mistake in joint values without which the ball is far better in its sockets; empty for none.
-
-    Args:
-        robot, data, around: see :func:`check_registration`. share: median distance of the ball from its socket,
-            relative to the motion of the tip. tried: joint values (N, n) without a mistake, and what it is.
-    """
-    best, words = min(MISTAKES.remaining * share, MISTAKES.usual), ""
-    for q, mistake in tried:
-        found = register_sockets(robot if around is None else around, q, data.socket_numbers)
-        left = float(found.distances.median()) / _motion(robot, q)
-        best, words = (left, mistake) if left < best else (best, words)
-    return words
-
-
 def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification, found: SocketRegistration) -> None:
     """Warn of rows in sockets that do not belong to the robot that a device measured.
 
     Args:
         robot: n joints. device: rows with measured positions. start: their registration. found: that of the ball.
     """
-    if len(known(device.points)) < LIMITS.overdetermined * (6 + 3 * device.markers):
+    if len(known(device.points)) < gates.OVERDETERMINED * (6 + 3 * device.markers):
         return  # few positions are fitted nearly exactly: their residual does not show the robot's errors
     typical, own = float(distances(start.geometry, device).nanmedian()), float(found.distances.median())
-    if own > max(LIMITS.other_residuals * typical, LIMITS.other_share * robot.reach):
+    if own > max(gates.OTHER_ROBOT_RESIDUALS * typical, gates.OTHER_ROBOT_SHARE * robot.reach):
         what = "the rows in sockets do not fit the robot whose positions were measured"
         got = f"a median of {1e3 * own:.3g} mm"
         expected = f"a spread within sockets below the {1e3 * typical:.3g} mm of these"
@@ -259,25 +195,25 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
     own = away.gather(1, socket[:, None])[:, 0]
     nearest, where = away.scatter(1, socket[:, None], torch.inf).min(1)
-    wrong = (own > LIMITS.wrong_medians * own.median()) & (nearest < LIMITS.fits * own)
+    wrong = (own > gates.WRONG_SOCKET_MEDIANS * own.median()) & (nearest < gates.OTHER_SOCKET_FITS * own)
     rows = wrong.nonzero()[:, 0].tolist()
     if not rows:
         return
     named = [f"row {int(data.line_numbers[row])} fits '{sockets.names[int(where[row])]}'" for row in rows]
     what = f"{len(rows)} of {len(data)} rows seem to be in another socket than they say: {few(named)}"
-    if len(rows) > LIMITS.wrong_share * len(data):
+    if len(rows) > gates.WRONG_SOCKETS * len(data):
         raise MeasurementError.of(what, fix="check the columns that name the place and the socket")
     warn_user(sentence(what, fix="check their sockets; they hardly count"))
 
 
 def _check_tilt(found: SocketRegistration) -> None:
     most, _, least = found.tilt.tolist()
-    if most < LIMITS.turned:
+    if most < gates.TURNED:
         what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
         raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
-    if least < LIMITS.tilted:
+    if least < gates.TILTED:
         what = "the tool is never tilted in the sockets: the place of the ball along one direction is not determined"
-        warn_user(sentence(what, fix="tilt the tool by 20 degrees or more, to several sides"))
+        warn_user(sentence(what, fix=TILT))
 
 
 def _check_distances(data: Measurements, found: SocketRegistration) -> None:
@@ -285,11 +221,11 @@ def _check_distances(data: Measurements, found: SocketRegistration) -> None:
     median, sockets = float(found.distances.median()), data.known_sockets
     for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
-        if abs(seen - length) <= max(LIMITS.distance_share * length, LIMITS.distance_medians * median):
+        if abs(seen - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * median):
             continue
         what = f"the known distance of the sockets '{sockets.names[first]}' and '{sockets.names[second]}'"
         said = {"expected": f"about {1e3 * seen:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
-        if in_other_unit(length / max(seen, 1e-9), LIMITS.distance_share):
+        if in_other_unit(length / max(seen, 1e-9), gates.DISTANCE_SHARE):
             raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")
         fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
         warn_user(sentence(what, **said, fix=fix))
@@ -309,19 +245,19 @@ def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, pl
     """
     _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
     reach = float(positions.norm(dim=1).max())
-    if len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(positions) ** 0.5:
+    if len(s) < 3 or float(s[2]) > gates.FLAT * reach * len(positions) ** 0.5:
         return
     rows = (socket >= 0).nonzero()[:, 0]
     usual = place[socket[rows]].mode().values
     rows = rows[place[socket[rows]] == usual]
     resting = fitted.x[rows], positions[socket[rows]], socket[rows]
-    step = RAISED * reach * axes[2]
+    step = gates.RAISED * reach * axes[2]
     tried = (with_raised_place(fitted, *resting, sign * step) for sign in (1.0, -1.0))
     errors = [error for error in tried if error is not None]
-    if errors and min(errors) < WORTHWHILE_ERROR_RATIO * now:
+    if errors and min(errors) < gates.WORTHWHILE_PLACE * now:
         what = "the sockets lie near a plane"
         expected = (
-            f"about {1e3 * min(errors):.2g} mm of error with one place {1e3 * RAISED * reach:.0f} mm away from it"
+            f"about {1e3 * min(errors):.2g} mm of error with one place {1e3 * gates.RAISED * reach:.0f} mm away from it"
         )
         fix = "raise or tilt the block at one place, and tilt the tool"
         warn_user(sentence(what, expected=expected, got=f"{1e3 * now:.2g} mm", fix=fix))

@@ -12,14 +12,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.plausibility import LIMITS
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
 
-FEWEST_ROWS = 6
-"""Rows of a device from which one value in all of them says something."""
 OF_DEVIATIONS = "std_"
 """Prefix of columns of known standard deviations, which may well be equal."""
 
@@ -61,7 +59,7 @@ def stuck_columns(data: Any) -> list[Stuck]:
             if not isinstance(values, Tensor) or name.startswith(OF_DEVIATIONS):
                 continue
             seen = ~values.isnan()
-            if int(seen.sum()) >= FEWEST_ROWS and bool((values[seen] == values[seen][0]).all()):
+            if int(seen.sum()) >= gates.STUCK_ROWS and bool((values[seen] == values[seen][0]).all()):
                 found.append(Stuck(f"'{name}' of the {words}", rows[seen.to(rows.device)]))
     return found
 
@@ -85,7 +83,7 @@ def warn_of_stuck(data: TangentData, stuck: Sequence[Stuck]) -> None:
     for one in stuck:
         rows, shape = one.rows.to(data.values.device), (data.noise_model.bodies, -1)
         least = _smallest_motion(data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape))
-        bad += [(one, least)] if least > LIMITS.geometric_residual * size else []
+        bad += [(one, least)] if least > gates.GEOMETRIC_RESIDUAL * size else []
     if bad:
         what = stuck_words([one for one, _ in bad])
         expected = f"values that change by {1e3 * min(least for _, least in bad):.3g} mm or more, as the robot moves"
@@ -103,12 +101,12 @@ def warn_of_outliers(wrong: Sequence[int], data: Any, reason: str, stuck: Sequen
     flags = torch.zeros(len(data), dtype=torch.bool, device=HOST)
     flags[list(wrong)] = True
     devices = list(device_rows(data))
-    many = [one for one in devices if float(flags[one.rows].double().mean()) > LIMITS.gross_share]
+    many = [one for one in devices if float(flags[one.rows].double().mean()) > gates.GROSS_SHARE]
     counts = few([f"{int(flags[one.rows].sum())} of {len(one.rows)} {one.words}" for one in many], MOST_NAMES)
     held = [one for one in stuck if bool(flags[one.rows].any())]
     also = f"; {stuck_words(held)}: a stuck sensor?" * bool(held)
-    expected, got = f"at most {100 * LIMITS.gross_share:.0f} %", f"for the worst row: {reason}"
-    if float(flags.double().mean()) > LIMITS.gross_share:
+    expected, got = f"at most {100 * gates.GROSS_SHARE:.0f} %", f"for the worst row: {reason}"
+    if float(flags.double().mean()) > gates.GROSS_SHARE:
         what = f"{len(wrong)} of {len(data)} rows are outliers: do not rely on this calibration"
         fix = "check that rows pair joints with their own points, and that markers keep their numbers"
         fix += f"; most of them are {counts}" * (0 < len(many) < len(devices))

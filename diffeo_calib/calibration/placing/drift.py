@@ -3,7 +3,7 @@
 Between the smallest and the largest value of the column the measuring frame shifts and turns, lengths grow, and every
 joint offset changes, by unknowns u with a wide prior that all rows share: row i differs from the model by a_i B_i u
 with a_i from -1/2 to 1/2, so that the model holds for the middle of the column. The unknowns stay in the fit where they
-predict rows that are left out better, see :func:`worth_it`.
+predict rows that are left out better, see diagnostics/hypotheses.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
-from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -25,10 +24,6 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 """Prior standard deviations over the whole range: of the frame's shift and turn, of lengths, and of joint offsets."""
-WORTHWHILE_ERROR_RATIO = 0.97
-"""Part of the RMS leave-one-out error that may remain at most with the drift in the model."""
-SURE = 3.0
-"""Standard deviations from which a gain in squared errors is no chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +94,3 @@ class Drift(DeviceSet):
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`: unknowns in m and rad over the range of every column."""
         return {"drift": dict(zip(self.known.names, self.known.sizes.tolist(), strict=True))}
-
-
-def worth_it(before: LeaveOneOut, after: LeaveOneOut) -> bool:
-    """Whether rows that are left out prove a drift: most of them, and not a few large errors."""
-    first, second = (one.errors.square().nansum(1) for one in (before, after))
-    gain = first - second
-    sure = float(gain.mean()) > SURE * float(gain.std()) / len(gain) ** 0.5
-    return sure and float(second.mean()) < WORTHWHILE_ERROR_RATIO**2 * float(first.mean())

@@ -15,15 +15,16 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
-from diffeo_calib.calibration.diagnostics.labels import MOST_MASSES, label_text
+from diffeo_calib.calibration.diagnostics.labels import OtherLabel, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled
+from diffeo_calib.calibration.placing.placement import OtherRows, Placement, Settled
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
@@ -249,7 +250,7 @@ class Placed:
         seen = model.at_payloads(table.payload)(table.q).detach()
         labels = [label for one in self.placement for label in one.labels(own, seen)]
         masses = table.masses.unique().tolist()
-        for mass in masses if len(masses) <= MOST_MASSES else ():
+        for mass in masses if len(masses) <= gates.MOST_MASSES else ():
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
         return label_text((seen - table.points).norm(dim=-1).nanmean(1), flags[own.rows], table.line_numbers, labels)

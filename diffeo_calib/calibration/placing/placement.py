@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics.moved_devices import Cause
+from diffeo_calib.calibration.diagnostics.labels import OtherLabel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
@@ -26,6 +26,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
@@ -50,18 +51,6 @@ class SeenRows(NamedTuple):
 
 
 Seen = SeenRows | TangentData
-
-
-class OtherLabel(NamedTuple):
-    """How M rows would err with another label than theirs.
-
-    Args:
-        name: in words. applies: (M,) boolean, the rows that do not have it. errors: (M,) m.
-    """
-
-    name: str
-    applies: Tensor
-    errors: Tensor
 
 
 class OtherRows(NamedTuple):
@@ -154,16 +143,12 @@ class DeviceSet(ABC):
         """How rows that tell coordinates would err under other names of devices; ``seen`` (N, P, 3) by the model, m."""
         return ()
 
-    def changes(self, data: Seen) -> Iterable[Cause]:
-        """Possible changes of these devices during the measurements, with their effects (N, R, U) on all rows."""
+    def hypotheses(self, data: Seen) -> Iterable[Hypothesis]:
+        """What of these devices may change during the measurements, or be wrong, with effects (N, R, U) on all rows."""
         return ()
 
     def groups(self) -> Iterable[tuple[str, Tensor]]:
         """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
-        return ()
-
-    def doubts(self, data: Seen) -> Iterable[Cause]:
-        """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
         return ()
 
     def views(self) -> Mapping[str, View]:
@@ -216,13 +201,9 @@ class Placement:
         """The first set of a kind; None without one."""
         return next((own for own in self.sets if isinstance(own, kind)), None)
 
-    def changes(self, data: Seen) -> list[Cause]:
-        """Possible changes of all devices."""
-        return [cause for own in self.sets for cause in own.changes(data)]
-
-    def doubts(self, data: Seen) -> list[Cause]:
-        """What all devices are said to hold."""
-        return [cause for own in self.sets for cause in own.doubts(data)]
+    def hypotheses(self, data: Seen, *, said: bool) -> list[Hypothesis]:
+        """What all devices are said to hold, or what of them may change."""
+        return [one for own in self.sets for one in own.hypotheses(data) if one.said == said]
 
     def sees(self, row: int, points: Tensor) -> Tensor:
         """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""

@@ -6,14 +6,13 @@ twist of the first joint are held, the devices are unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
@@ -35,7 +34,7 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.devices import Devices, Effect, check_devices
+from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import OtherReadings
@@ -90,20 +89,12 @@ class ReadingDevices(DeviceSet):
         found[self.rows[:, None], self.numbers] = own
         return found
 
-    def changes(self, data: Seen) -> Iterator[Cause]:
-        """See :class:`DeviceSet`: every device moved, or its zero was set anew."""
-        yield from self._causes(data, self.devices.changes(self._seen(data), self.device))
-
-    def doubts(self, data: Seen) -> Iterator[Cause]:
-        """See :class:`DeviceSet`."""
-        yield from self._causes(data, self.devices.doubts(self._seen(data), self.device))
-
-    def _causes(self, data: Seen, found: Iterable[Effect]) -> Iterator[Cause]:
-        """Effects (M, r, U) on the rows of these devices as effects on all rows."""
-        for effect in found:
-            whole = effect.motion.new_zeros(*data.y.shape, effect.motion.shape[2])
-            whole[self.rows[:, None], self.numbers] = effect.motion
-            yield Cause(effect.name, whole, effect.unit, effect.fix)
+    def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
+        """See :class:`DeviceSet`: those of the devices, with effects on all rows."""
+        for one in self.devices.hypotheses(self._seen(data), self.device):
+            whole = one.effects.new_zeros(*data.y.shape, one.effects.shape[2])
+            whole[self.rows[:, None], self.numbers] = one.effects
+            yield one._replace(effects=whole)
 
     def settled(self, found: Settled) -> ReadingDevices:
         """See :class:`DeviceSet`."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics.moved_devices import Cause
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
@@ -28,7 +28,7 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
+from diffeo_calib.calibration.findings import Outlier, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.identification.registration import (
     register_sockets,
@@ -48,6 +48,7 @@ from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
@@ -194,7 +195,7 @@ class SocketDevices(DeviceSet):
         """Three of each socket."""
         return self.root.shape[1]
 
-    def doubts(self, data: Seen) -> Iterator[Cause]:
+    def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         """See :class:`DeviceSet`: the known distances, the same at all places."""
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.sockets.blocks:
@@ -208,7 +209,9 @@ class SocketDevices(DeviceSet):
             if len(block) > 1:  # at several places
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
-            yield Cause(name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix)
+            yield Hypothesis(
+                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, said=True
+            )
 
     def effects(self, data: Seen) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
@@ -440,7 +443,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     if not bool(judged.any()):
         return []
     size = float(squares[judged].median()) / chi2_median(3)
-    limit = size * chi2_above(FALSE_ALARM_PROBABILITY / int(judged.sum()), 3)
+    limit = size * chi2_above(gates.OUTLIER_CHANCE / int(judged.sum()), 3)
     bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
     bad[:, -1] = judged & (squares > limit)
     distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -15,113 +14,55 @@ from diffeo_calib.maps.linearisation import Linearisation
 SMALLEST_AMPLITUDE_SHARE = 0.5
 """A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
 OFFSET_DEVIATION_RAD_M = 3e-4
-"""Of a joint offset, to which the sizes above are relative: they span 0.05 to 5 mrad."""
+"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
 NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
 """Eigenvalues of a transmission's covariance below this share of the largest are left out."""
 
 
 @dataclass(frozen=True, eq=False)
-class ChangedPart(ABC):
-    """A part of a model that may have changed.
+class ChangedPart:
+    """A part of a model that may have changed: a hypothesis whose prior is that of the part in the old model.
 
     Args:
         name: of the joint, or "gravity" or "geometry".
+        joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
+        kernel: that of the joint's error; None for its offset, which all readings lack since then.
+        columns: (k,) numbers of the parameters. deviations: (k,) their prior standard deviations.
     """
 
     name: str
+    joint: int | None = None
+    kernel: RadialKernel | None = None
+    columns: Tensor | None = None
+    deviations: Tensor | None = None
 
-    @abstractmethod
-    def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
+    @property
+    def offset(self) -> bool:
+        """Whether it is the offset of a joint."""
+        return self.joint is not None and self.kernel is None
 
-    @abstractmethod
-    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
-        """RMS of the part over M configurations, in its own unit, prior variances as old.
-
-        Args:
-            at: what was measured. whole: the coordinates of the markers. mu: (M, m) end momenta.
-        """
-
-    def displacement(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
-        """RMS displacement of the markers by it, m; arguments as :meth:`size`."""
-        moved = self.root(whole) @ torch.einsum("imc,im->c", self.root(at), mu)
-        return float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
-
-
-@dataclass(frozen=True, eq=False)
-class Transmission(ChangedPart):
-    """The transmission error of one joint.
-
-    Args:
-        joint: its column. kernel: its kernel term.
-    """
-
-    joint: int
-    kernel: RadialKernel
-
-    def root(self, at: Linearisation) -> Tensor:
-        """See :class:`ChangedPart`."""
-        values, vectors = torch.linalg.eigh(self._covariance(at))
-        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        shapes = vectors[:, kept] * values[kept].sqrt()  # (M, c)
-        return at.joint_to_start[:, :, self.joint, None] * shapes[:, None]
-
-    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
-        """In rad or m."""
-        turned = (at.joint_to_start[:, :, self.joint] * mu).sum(1)
-        return float((self._covariance(at) @ turned).square().mean().sqrt())
-
-    def _covariance(self, at: Linearisation) -> Tensor:
-        """(M, M) of the joint's error, rad^2 or m^2."""
+    def shapes(self, at: Linearisation) -> Tensor:
+        """(M, c) columns whose products are the prior covariance of the joint's errors, rad or m."""
         points = at.joint[0].points
+        if self.kernel is None:
+            return torch.full_like(points[:, :1], OFFSET_DEVIATION_RAD_M)
         one = points.new_zeros(len(points), 1, points.shape[1])
         one[:, 0, self.joint] = 1.0
-        return self.kernel.gram(points, one, points, one)
-
-
-@dataclass(frozen=True, eq=False)
-class Parameters(ChangedPart):
-    """A group of the nominal map's parameters.
-
-    Args:
-        columns: (k,) their numbers. variances: (k,) their prior variances.
-    """
-
-    columns: Tensor
-    variances: Tensor
+        values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
+        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
+        return vectors[:, kept] * values[kept].sqrt()
 
     def root(self, at: Linearisation) -> Tensor:
-        """See :class:`ChangedPart`."""
-        return at.sensitivity[..., self.columns] * self.variances.sqrt()
-
-    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
-        """In m, of the markers."""
-        return self.displacement(at, whole, mu)
+        """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
+        if self.joint is None:
+            return at.sensitivity[..., self.columns] * self.deviations
+        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class Offset(ChangedPart):
-    """The offset of one joint, which all its readings lack since then: a new zero, a slipped gear.
-
-    Args:
-        joint: its column.
-    """
-
-    joint: int
-
-    def root(self, at: Linearisation) -> Tensor:
-        """See :class:`ChangedPart`."""
-        return OFFSET_DEVIATION_RAD_M * at.joint_to_start[:, :, self.joint, None]
-
-    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
-        """In rad or m, with its sign."""
-        return OFFSET_DEVIATION_RAD_M * float(torch.einsum("imc,im->c", self.root(at), mu))
-
-
-def offsets_of(rows: NewRows) -> list[Offset]:
+def offsets_of(rows: NewRows) -> list[ChangedPart]:
     """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
     chain = rows.points.fitted.geometry.chain
-    return [Offset(f"the offset of {name}", joint) for joint, name in enumerate(chain.joint_names)]
+    return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(chain.joint_names)]
 
 
 def parts_of(rows: NewRows) -> list[ChangedPart]:
@@ -133,11 +74,11 @@ def parts_of(rows: NewRows) -> list[ChangedPart]:
     found: list[ChangedPart] = []
     for joint, term in own.items() if least > 0 else ():
         kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
-        found.append(Transmission(chain.joint_names[joint], joint, kernel))
+        found.append(ChangedPart(chain.joint_names[joint], joint, kernel))
     every = torch.arange(len(prior), device=prior.device)
     groups = {"gravity": every[nominal.sag], "geometry": every[nominal.geometry.slices["joints"]]}
     for name, columns in groups.items():
         supported = columns[prior[columns] > 0]
         if len(supported):
-            found.append(Parameters(name, supported, prior[supported]))
+            found.append(ChangedPart(name, columns=supported, deviations=prior[supported].sqrt()))
     return found

@@ -22,12 +22,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.judgement import find_block
 from diffeo_calib.calibration.recalibration.changed_parts import (
     OFFSET_DEVIATION_RAD_M,
     ChangedPart,
-    Offset,
-    Transmission,
     offsets_of,
     parts_of,
 )
@@ -75,55 +75,36 @@ def likelihood_ratios(
     R = Noise(rows.weighted_noise).add_to(torch.zeros_like(base))
     seen = rows.noise_model.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
-    factors = NOISE_FACTORS.to(base)
-    likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]
+    factors = [torch.linalg.cholesky(base + f * R) for f in NOISE_FACTORS.to(base)]
+
+    def white(values: Tensor) -> list[Tensor]:
+        return [torch.linalg.solve_triangular(factor, values, upper=False) for factor in factors]
+
+    def densities(whitened: list[Tensor]) -> Tensor:
+        """(noise, k) log densities without a change, but for a constant."""
+        each = zip(whitened, factors, strict=True)
+        return torch.stack([-0.5 * r.square().sum(0) - factor.diagonal().log().sum() for r, factor in each])
+
+    likeliest = int(densities(white(residual)).argmax())
     draws = torch.randn(len(R), SIMULATED_DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
-    samples = torch.cat([residual, torch.linalg.cholesky(base + likeliest * R) @ draws], 1)
-    densities = [_Density(base + f * R, samples) for f in factors]
-    without = torch.stack([density.plain for density in densities]).amax(0)
-    ratios, variances = {}, {}
+    samples = white(torch.cat([residual, factors[likeliest] @ draws], 1))
+    plain, sizes, ratios, variances = densities(samples), SIZES.to(base), dict[str, Tensor](), dict[str, float]()
     for name, root in roots.items():
-        changed = [density.with_change(root.flatten(0, 1)[seen]) for density in densities]
-        best = torch.stack([value for value, _ in changed])
-        ratios[name] = 2.0 * (best.amax(0) - without)
-        variances[name] = changed[int(best[:, 0].argmax())][1]
+        each = zip(white(root.flatten(0, 1)[seen]), samples, plain, strict=True)
+        changed = torch.cat([own + Evidence((E.T @ r).mT, E.T @ E).log_odds(sizes) for E, r, own in each])
+        ratios[name] = 2.0 * (changed.amax(0) - plain.amax(0))
+        variances[name] = float(SIZES[int(changed[:, 0].argmax()) % len(SIZES)])
     largest = torch.stack(list(ratios.values())).amax(0)[1:]
     found = {}
     for name, values in ratios.items():
         value = float(values[0])
         found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + SIMULATED_DRAWS), variances[name])
-    return found, float(likeliest.sqrt())
-
-
-class _Density:
-    """Log densities of samples (M m, k) under a covariance, but for a constant.
-
-    Attributes:
-        plain: (k,) under the covariance itself.
-    """
-
-    def __init__(self, covariance: Tensor, samples: Tensor) -> None:
-        self.factor = torch.linalg.cholesky(covariance)
-        self.white = torch.linalg.solve_triangular(self.factor, samples, upper=False)
-        self.plain = -0.5 * self.white.square().sum(0) - self.factor.diagonal().log().sum()
-
-    def with_change(self, root: Tensor) -> tuple[Tensor, float]:
-        """The largest density (k,) with a change of any size, and the likeliest size for the first sample.
-
-        Args:
-            root: (M m, c) columns of the change's covariance.
-        """
-        U, s, _ = torch.linalg.svd(torch.linalg.solve_triangular(self.factor, root, upper=False), full_matrices=False)
-        scaled = SIZES.to(s)[:, None] * s.square()  # (sizes, c)
-        gain = 0.5 * (scaled / (1.0 + scaled) @ (U.T @ self.white).square() - scaled.log1p().sum(1)[:, None])
-        return self.plain + gain.amax(0), float(SIZES[int(gain[:, 0].argmax())])
+    return found, float(NOISE_FACTORS[likeliest].sqrt())
 
 
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""
 FEWEST_ROWS = 5
-TOLD_APART = 4.0
-"""Difference of likelihood ratios up to which the rows do not tell two offsets apart."""
 MOST_OUTLIERS = 0.5
 """Share of the rows of a session that hardly count, from which it deviates as a whole."""
 RANGE_MARGIN = 0.02
@@ -262,44 +243,34 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
     if changes.found or not groups:
         return changes, drifts
     found = []
-    for where, group in groups.items():
-        own, _ = _changes_of(rows.kept(group.rows), level=level / len(groups), seed=seed)
+    for where, (index, deviates) in groups.items():
+        own, _ = _changes_of(group := rows.kept(index), level=level / len(groups), seed=seed)
         found += [replace(one, where=where) for one in own.found]
-        if group.deviates and not own.found:
-            found.append(_unknown(rows.kept(group.rows), where, level))
+        if deviates and not own.found:
+            numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
+            size = float(group.residual.unflatten(1, (-1, numbers)).square().sum(2).mean().sqrt())  # m at the tool
+            found.append(Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where))
     return replace(changes, found=tuple(found)), []
 
 
-class Group(NamedTuple):
-    """Rows that were measured together: their numbers, and whether hardly any of them fits the old model."""
+def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
+    """Rows that were measured together, by their names: their numbers, and whether hardly any fits the old model.
 
-    rows: Tensor
-    deviates: bool
-
-
-def groups_of(rows: NewRows) -> dict[str, Group]:
-    """Sessions, if there are several, and else the block of rows that hardly count, by their names."""
+    Sessions, if there are several, and else the block of rows that hardly count.
+    """
     data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
     named = [group for one in rows.before.sessions for group in one.groups()]
     if named:
-        return {name: Group(own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
-    numbers = (
-        data.line_numbers if len(data.line_numbers.unique()) == len(data) else torch.arange(len(data), device=HOST)
-    )
-    order = numbers.to(HOST).argsort()
+        return {name: (own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
+    distinct = len(data.line_numbers.unique()) == len(data)
+    numbers = data.line_numbers.to(HOST) if distinct else torch.arange(len(data), device=HOST)
+    order = numbers.argsort()
     place = find_block(flags[order])
     if place is None or place[1] - place[0] < FEWEST_ROWS:
         return {}
     block = order[place[0] : place[1]]
-    lines = numbers[block].tolist()
-    return {f"rows {lines[0]} to {lines[-1]}": Group(block, deviates=True)}
-
-
-def _unknown(rows: NewRows, where: str, level: float) -> Change:
-    """A change of rows that deviate together, of no part that is known."""
-    numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
-    size = float(rows.residual.unflatten(1, (-1, numbers)).square().sum(2).mean().sqrt())  # m at the tool
-    return Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where)
+    first, *_, last = numbers[block].tolist()
+    return {f"rows {first} to {last}": (block, True)}
 
 
 def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
@@ -327,11 +298,13 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         base = base + ratios[name].variance * (root @ root.T)
         drifts.append(Drift(parts[name], ratios[name].variance))
         found[name] = ratios[name]
-        others[name] = _as_good(name, ratios, parts)
+        least = ratios[name].value - gates.OFFSETS_TOLD_APART
+        as_good = [each for each in ratios if each != name and parts[each].offset and ratios[each].value > least]
+        others[name] = tuple(as_good) if parts[name].offset else ()
     factor = torch.linalg.cholesky(Noise(rows.weighted_noise).add_to(base))
     changes = tuple(
-        replace(_change(rows, factor, drift, found[drift.part.name]), others=others[drift.part.name])
-        for drift in drifts
+        _change(rows, factor, drift, probability=found[name].probability, others=others[name])
+        for name, drift in zip(found, drifts, strict=True)
     )
     probabilities = {name: ratio.probability for name, ratio in first.items()}
     return Changes(changes, probabilities, noise, len(rows), level, () if drifts else _smallest(rows, factor)), drifts
@@ -345,12 +318,12 @@ LARGEST_OFFSET_RAD_M = 5e-3
 
 def _smallest(rows: NewRows, factor: Tensor) -> tuple[SmallestOffset, ...]:
     """See :class:`Changes`; ``factor``: Cholesky factor of the covariance of all rows."""
-    chain, found = rows.points.fitted.geometry.chain, []
-    for part in offsets_of(rows):
-        white = torch.linalg.solve_triangular(factor, part.root(rows.at).flatten()[:, None], upper=False)
-        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(white.norm())
+    chain, found, residual = rows.points.fitted.geometry.chain, [], rows.residual.flatten()
+    for joint, part in enumerate(offsets_of(rows)):
+        evidence = Evidence.by(part.root(rows.at).flatten(0, 1), residual, factor)
+        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
         size = size if size < LARGEST_OFFSET_RAD_M else inf
-        found.append(SmallestOffset(chain.joint_names[part.joint], size, chain.kinds[part.joint] != "prismatic"))
+        found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
     return tuple(found)
 
 
@@ -361,27 +334,17 @@ def within_old_range(rows: NewRows) -> Tensor:
     return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
-def _as_good(name: str, ratios: dict[str, Ratio], parts: dict[str, ChangedPart]) -> tuple[str, ...]:
-    """Other offsets that explain the rows as well as that of this name."""
-    if not isinstance(parts[name], Offset):
-        return ()
-    least = ratios[name].value - TOLD_APART
-    return tuple(
-        each for each in ratios if each != name and isinstance(parts[each], Offset) and ratios[each].value > least
-    )
-
-
-def _change(rows: NewRows, factor: Tensor, drift: Drift, ratio: Ratio) -> Change:
-    """The change with its expected size; ``factor``: Cholesky factor of the covariance of all rows."""
-    mu = torch.cholesky_solve(rows.residual.flatten()[:, None], factor).view_as(rows.y)
-    part, scaled = drift.part, drift.variance * mu
-    kinds = rows.points.fitted.geometry.chain.kinds
-    angle = isinstance(part, (Transmission, Offset)) and kinds[part.joint] != "prismatic"
-    whole, root = rows.seen[1], part.root(rows.at)
-    size, displacement = part.size(rows.at, whole, scaled), part.displacement(rows.at, whole, scaled)
+def _change(rows: NewRows, factor: Tensor, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
+    """The change with its expected size; ``factor``: as above."""
+    (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
+    evidence = Evidence.by(part.root(rows.at).flatten(0, 1), rows.residual.flatten(), factor)
+    moved = part.root(rows.seen[1]) @ (variance * evidence.g)
+    size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
     deviation = None
-    if isinstance(part, Offset):
-        white = torch.linalg.solve_triangular(factor, root.flatten()[:, None], upper=False)
-        share = drift.variance * float(white.square().sum())
-        deviation = OFFSET_DEVIATION_RAD_M * (drift.variance * max(1.0 - share, 0.0)) ** 0.5
-    return Change(part.name, size, angle, displacement, ratio.probability, deviation)
+    if part.joint is not None:
+        errors = part.shapes(rows.at) @ (variance * evidence.g)
+        size = float(errors[0]) if part.offset else float(errors.square().mean().sqrt())
+    if part.offset:
+        deviation = OFFSET_DEVIATION_RAD_M * (variance * max(1.0 - variance * float(evidence.H), 0.0)) ** 0.5
+    angle = part.joint is not None and kinds[part.joint] != "prismatic"
+    return Change(part.name, size, angle, displacement, probability, deviation, others)

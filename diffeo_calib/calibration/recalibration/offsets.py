@@ -1,11 +1,7 @@
 """Joint offsets between two calibrations, and those that a moved device or marker would hide.
 
-Two models differ by d over the workspace, with covariance K. With J_k the derivative of the points by an offset, its
-most probable change and deviation are
-
-    s = J_k^T K^-1 d / h,    sd = 1 / sqrt(h),    h = J_k^T K^-1 J_k,
-
-K with the places of device and markers unknown. An offset whose J_k these places reproduce is not named: they hide it.
+Two models differ over the workspace, with a covariance in which the places of device and markers are unknown; every
+offset is a hypothesis. An offset whose motion these places reproduce is not named: they hide it.
 """
 
 from __future__ import annotations
@@ -15,7 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changes import LEVEL, TOLD_APART, Change, Changes
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
@@ -27,8 +25,6 @@ from diffeo_calib.robots.tree import Tree
 
 FLOOR_M = 5e-6
 """Deviation of each coordinate of a difference of models, beside what both expect."""
-HIDDEN_SHARE = 0.3
-"""Displacement by an offset that places do not reproduce, relative to the noise, up to which rows do not show it."""
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
 SMALLEST_CHANCE = 1e-6
@@ -77,31 +73,30 @@ def hidden_offsets(robot: Tree, before: Before, changes: Changes) -> tuple[Hidde
         K, free = found.covariance[own, own], found.covariance.diagonal()[own] > 0
         if not bool(free.all()):
             continue
-        P, count = _precision(K)
-        total = float(place @ P @ place)
+        white = _whitening(K)
+        away = white @ place
+        count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):
             continue
         for joint, name in enumerate(robot.joint_names):
-            d = torch.linalg.lstsq(S[:, own], J[:, joint, None]).solution[:, 0]
-            W = P @ d
-            known = float(W @ d)
-            if known <= 0.0:  # It moves the places only as they are known not to move.
+            d = torch.linalg.lstsq(S[:, own], J[:, joint, None]).solution
+            evidence = Evidence((white @ d).T @ away, (white @ d).T @ white @ d)
+            if float(evidence.H) <= 0.0:  # It moves the places only as they are known not to move.
                 continue
-            size, deviation = float(W @ place) / known, known**-0.5
-            unseen = abs(size) * float((J[:, joint] - S[:, own] @ d).square().mean().sqrt())
-            left = total - (size / deviation) ** 2
-            if unseen < HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
+            size, deviation = float(evidence.size), float(evidence.H) ** -0.5
+            unseen = abs(size) * float((J[:, joint, None] - S[:, own] @ d).square().mean().sqrt())
+            left = total - float(evidence.gain)
+            if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
                 hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != PRISMATIC, instead))
     return tuple(hidden)
 
 
-def _precision(K: Tensor) -> tuple[Tensor, int]:
-    """Pseudo-inverse of a covariance, (k, k), and its rank: markers that moved together leave it singular."""
+def _whitening(K: Tensor) -> Tensor:
+    """(k, K) root of the pseudo-inverse of a covariance of rank k: markers that moved together leave it singular."""
     scale = K.diagonal().sqrt()
     values, Q = torch.linalg.eigh(K / scale / scale[:, None])
     kept = values > RANK_TOLERANCE * values[-1]
-    Q = Q[:, kept] / scale[:, None]
-    return Q / values[kept] @ Q.mT, int(kept.sum())
+    return (Q[:, kept] / scale[:, None] / values[kept].sqrt()).mT
 
 
 def _motion(found: Registration) -> Tensor:
@@ -130,26 +125,25 @@ def changed_offsets(robot: Tree, first: FittedMap, placed: RegisteredMap, q: Ten
     left = list(range(robot.n))
     while left:
         factor = torch.linalg.cholesky(K)
-        white, columns = (torch.linalg.solve_triangular(factor, each, upper=False) for each in (d[:, None], J[:, left]))
-        h, g = columns.square().sum(0), (columns * white).sum(0)
-        excess = ((white.square().sum() - g**2 / h) / len(d)).clamp(min=1.0)
-        ratios = g**2 / h / excess
-        chances = [chi2_probability(float(ratio), 1) * robot.n for ratio in ratios]
-        first_seen = first_seen or dict(zip((robot.joint_names[k] for k in left), chances, strict=True))
-        best = int(ratios.argmax())
-        if chances[best] > LEVEL:
+        each = {k: Evidence.by(J[:, k, None], d, factor) for k in left}
+        ratios = {k: float(one.gain) / one.excess for k, one in each.items()}
+        chances = {k: chi2_probability(ratio, 1) * robot.n for k, ratio in ratios.items()}
+        first_seen = first_seen or {robot.joint_names[k]: chance for k, chance in chances.items()}
+        joint = max(ratios, key=lambda k: ratios[k])
+        if chances[joint] > LEVEL:
             break
-        joint, size = left[best], float(g[best] / h[best])
-        near = [k for n, k in enumerate(left) if n != best and float(ratios[n]) > float(ratios[best]) - TOLD_APART]
+        best = each[joint]
+        size, deviation = float(best.size), (best.excess / float(best.H)) ** 0.5
+        least = ratios[joint] - gates.OFFSETS_TOLD_APART
         changes.append(
             Change(
                 f"the offset of {robot.joint_names[joint]}",
                 size,
                 robot.kinds[joint] != PRISMATIC,
                 abs(size) * float(shown[:, joint].square().mean().sqrt()) * 3**0.5,
-                max(chances[best], SMALLEST_CHANCE),
-                float((excess[best] / h[best]).sqrt()),
-                tuple(f"the offset of {robot.joint_names[k]}" for k in near),
+                max(chances[joint], SMALLEST_CHANCE),
+                deviation,
+                tuple(f"the offset of {robot.joint_names[k]}" for k in left if k != joint and ratios[k] > least),
             )
         )
         left.remove(joint)

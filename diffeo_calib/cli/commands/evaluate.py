@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.judgement import accuracy, expected_rms, impossible_or_refused, judge
+from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import (
@@ -41,7 +41,6 @@ from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
-from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.set_ups import MeasuringFrames
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
@@ -61,7 +60,7 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
-    doubt = impossible_or_refused(model, places, data, found)
+    judged = judge(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), path.name)
     if options.residuals is not None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
@@ -76,9 +75,13 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     say(*expectation_lines(model, data))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
-    if doubt is not None:
-        raise MeasurementError(doubt)
-    _judge(model, places, data, found)
+    if judged.refusal is not None:
+        raise MeasurementError(judged.refusal)
+    positions = 0 if found.positions is None else len(found.positions.errors)
+    which = "rows" if judged.rows == positions else f"rows, evenly chosen of {positions},"
+    say(*outlier_lines(judged.outliers, judged.rows, which))
+    for text in judged.causes:
+        warn_user(text)
     if limit is not None:
         accept(accuracy(model, found, used, limit.unit), limit)
 
@@ -130,16 +133,6 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
         values = [entry[name] * (per_mm if metres else 1.0) for name in COLUMNS[5:9]]
         cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
-
-
-def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
-    """Name rows that look wrong, and warn of likely causes of large errors."""
-    judgement = judge(model, places, data, found)
-    positions = 0 if found.positions is None else len(found.positions.errors)
-    which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
-    say(*outlier_lines(judgement.outliers, judgement.rows, which))
-    for text in judgement.causes:
-        warn_user(text)
 
 
 def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:

@@ -11,10 +11,10 @@ from math import inf
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.findings import Outlier, Part, parts
-from diffeo_calib.calibration.judgement import block_text, larger_than_expected, step_text, steps_of
+from diffeo_calib.calibration.judgement import block_text, larger_than_expected, steps_of
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -234,12 +234,12 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
     large = predictions.errors.median > UNMOVED_MEDIAN_DEVIATIONS * float(predictions.claimed.nanmedian())
-    steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
-    named, text = [step_text(step) for step in steps[:1]], None
+    steps = steps_of(model, data) if len(outliers) >= gates.LAG_ROWS else []
+    named, text = [step.sentence() for step in steps[:1]], None
     if data.bodies.perhaps_moved(far=large):
         named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
-    if impossible(model, predictions.errors):
+    if impossible(model, predictions.errors.median):
         if not named:
             refuse_mistakes(model.robot, data)
         named = [" ".join([*(named or [text or ""]), data.set_up_hint]).strip()]

@@ -8,8 +8,8 @@ from math import nan
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
-from diffeo_calib.common.quantiles import chi2_above, chi2_median, known
+from diffeo_calib.calibration.findings import Outlier, excluded, found_outliers
+from diffeo_calib.common.quantiles import chi2_above, known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.table import Measurements
@@ -97,10 +97,7 @@ class Predictions:
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
-        squares = self.squares
-        size = max(1.0, float(squares.nanmedian()) / chi2_median(3))
-        limit = size * chi2_above(FALSE_ALARM_PROBABILITY / len(known(squares)), 3)
-        return found_outliers(model, self.data, squares > limit, self.errors.errors)
+        return found_outliers(model, self.data, excluded(self.squares, 3), self.errors.errors)
 
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:

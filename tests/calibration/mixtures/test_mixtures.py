@@ -12,7 +12,7 @@ from simulated_sockets import SocketRows
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import causes_of
+from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
@@ -239,7 +239,7 @@ def test_several_set_ups_of_the_device(
 
 
 def test_a_moved_device_moves_no_ball(tangent: TangentData) -> None:
-    device, _, marker = (cause.effects for cause in causes_of(tangent)[:3])
+    device, _, marker = (one.effects for one in changes_of(tangent)[:3])
     ball = tangent.visible[:, 3:]
     assert not bool(device[:, 3:][ball].any())
     assert bool(device[:, :3].any())
