@@ -24,6 +24,7 @@ from diffeo_calib.measurements.checks import (
 )
 from diffeo_calib.measurements.splits import (
     CONFIGURATIONS,
+    FEWEST_PER_DEVICE,
     PLACES,
     REPEAT_TOLERANCE,
     connected,
@@ -251,7 +252,7 @@ class RowGroups:
 
         Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
         repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
-        rows. Both parts keep the order of the rows.
+        rows. A device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
 
         Args:
             fraction: wanted share of rows in ``train``, between 0 and 1.
@@ -260,9 +261,14 @@ class RowGroups:
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
         """
-        held, units = self._divided
-        test = np.zeros(len(self.q), dtype=bool)
-        test[held] = ~in_train(units, fraction, seed, self._kind)
+        held, labels = self._divided
+        units, names, test = labels.numpy(), np.array(self.device_names), np.zeros(len(self.q), dtype=bool)
+        test[held] = out = ~in_train(labels, fraction, seed, self._kind)
+        for name in np.unique(names[test]):
+            own = (names == name) & (name != "")
+            for unit in np.unique(units[out & own[held]]) if own.sum() > FEWEST_PER_DEVICE else ():
+                if (own & ~test).sum() < FEWEST_PER_DEVICE and (test[held] & (units != unit)).any():
+                    test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
 
     def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:

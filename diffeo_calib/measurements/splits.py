@@ -15,6 +15,8 @@ from diffeo_calib.measurements.checks import of_measurements
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
+FEWEST_PER_DEVICE = 8
+"""Rows of a device that reports readings, with which it can be placed."""
 CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
 """Words for what a split keeps together."""
 

@@ -125,7 +125,7 @@ def test_readings_that_no_place_explains_are_warned_of(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
-    done = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "--reading", "height=wire", "-o", "warned.safetensors")
+    done = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "--reading", "height=signed", "-o", "warned.safetensors")
     assert done.code == 0
     assert "no place of ball and devices explains the readings" in " ".join(done.err.split())
 

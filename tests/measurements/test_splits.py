@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from table_bank import says, some
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE, REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -80,6 +80,17 @@ def test_split_without_repeats_is_exact_and_depends_on_the_seed() -> None:
     assert len(first) == len(second) == 70
     assert not torch.equal(first.q, second.q)
     assert [len(test) for _, test in data.folds(4)] == [25] * 4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_device_keeps_the_rows_that_place_it(seed: int) -> None:
+    data = some(60).with_sessions(["few"] * 10 + ["many"] * 50)
+    train, test = data.split(0.7, seed)
+    assert train.device_names.count("few") >= FEWEST_PER_DEVICE
+    assert test.device_names.count("few") <= 2
+    lone = some(10).with_sessions(["few"] * 10)
+    assert len(lone.split(0.3, seed)[1]) == 2
+    assert len(lone.rows(slice(0, 5)).split(0.6, seed)[1]) == 2  # too few in any case
 
 
 def test_split_refuses_what_cannot_be_split() -> None:
