@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Correction, Format, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Format, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -253,7 +253,7 @@ class ProgramTable:
     csv: Path
     joints: str | None
     table: TableFormat
-    given: Correction
+    given: Targets
 
     def commands(self, robot: Tree) -> Tensor:
         """(N, n) joint values, rad or m."""

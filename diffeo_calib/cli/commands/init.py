@@ -12,6 +12,7 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.common.errors import InputError, few
@@ -42,10 +43,11 @@ class Choice:
         return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
-def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
-    """Propose a campaign, write it, and print it; a file that was edited is replaced with ``force`` alone."""
+def run(given: InitOptions) -> None:
+    """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
+    csv, output = given.csv, given.output
     sheet = guess_sheet(csv)
-    choices = list(_choices(csv, urdf, output, sheet))
+    choices = list(_choices(csv, given.urdf, output, sheet))
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -53,7 +55,7 @@ def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
         f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
     ]
     content = ("\n".join(lines) + "\n").encode()
-    if output.exists() and not force and output.read_bytes() != content:
+    if output.exists() and not given.force and output.read_bytes() != content:
         fix = "name another file by -o, or add --force to replace it"
         raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
     write_whole(output, content)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -14,8 +13,8 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.declarations import RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
-from diffeo_calib.cli.options import TableOptions
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import few
@@ -23,10 +22,11 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-def run(old: Path, table: TableOptions, output: Path, **how: Any) -> None:
+def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
-    model = load_kinematics(old)
-    source = table_of(model, table)
+    model, output = load_kinematics(given.old), given.output
+    source = table_of(model, given.csv, given.rows, given.units)
+    how: Any = {**vars(given.tests), "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)
