@@ -215,7 +215,7 @@ def measured_why(found: PositionFindings) -> Section:
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
         "meshing; a wide band means that the joint was measured too little there."
     )
-    note = "Corrections are open where the rows do not tell them; those about or along parallel axes stand for one another."
+    note = "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
     notes = [*own.notes, note]
     tables = [_corrections(found.model, found.rows)]
     return replace(own, see=see, tables=tables, pictures=[*own.pictures, *pictures], notes=notes)
