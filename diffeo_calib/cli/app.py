@@ -140,8 +140,8 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
 
     def declare(plain: type[Options]) -> type[Options]:
         options = dataclass(frozen=True, kw_only=True)(plain)
-        leaves = dict(_leaves(options))
-        named = {one: hint for hint, field in leaves.values() for one in _names(field)} | {"--json": Path}
+        leaves = dict(leaves_of(options))
+        named = {one: hint for hint, field in leaves.values() for one in names_of(field)} | {"--json": Path}
         DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
         def run(_json: Any, **given: Any) -> None:
@@ -151,7 +151,7 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
             for key, (_, field) in leaves.items():
                 for path in given[key] if isinstance(given[key], list) else [given[key]]:
                     if isinstance(path, Path):
-                        shown = _names(field)[0] + f" {path}" * isinstance(given[key], list)
+                        shown = names_of(field)[0] + f" {path}" * isinstance(given[key], list)
                         files[field.metadata["file"]][shown] = path
             check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
             import_module(f"diffeo_calib.cli.commands.{name}").run(made)
@@ -167,15 +167,15 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
     return declare
 
 
-def _leaves(group: Any) -> Iterator[tuple[str, tuple[Any, Field[Any]]]]:
+def leaves_of(group: Any) -> Iterator[tuple[str, tuple[Any, Field[Any]]]]:
     """Name, type and field of the options of a group and of the groups in it."""
     hints = get_type_hints(group)
     for field in fields(group):
         own = hints[field.name]
-        yield from _leaves(own) if is_dataclass(own) else [(field.name, (own, field))]
+        yield from leaves_of(own) if is_dataclass(own) else [(field.name, (own, field))]
 
 
-def _names(field: Field[Any]) -> tuple[str, ...]:
+def names_of(field: Field[Any]) -> tuple[str, ...]:
     """What the user types for an option, or reads for an argument."""
     if field.metadata["made"] is typer.Argument:
         return (field.metadata["how"]["metavar"],)
@@ -184,7 +184,7 @@ def _names(field: Field[Any]) -> tuple[str, ...]:
 
 def _parameter(hint: Any, field: Field[Any]) -> inspect.Parameter:
     """A field as typer reads it."""
-    names = _names(field) if field.metadata["made"] is typer.Option else ()
+    names = names_of(field) if field.metadata["made"] is typer.Option else ()
     annotation = Annotated[hint, field.metadata["made"](*names, **field.metadata["how"])]
     default = inspect.Parameter.empty if field.default is MISSING else field.default
     return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

@@ -84,7 +84,7 @@ def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
     if isinstance(value, bool):
         return [f"--{name}"] * value
     values = value if isinstance(value, list) else [value]
-    if isinstance(value, list) and (name in JOINED or not _has(hint, list)):
+    if isinstance(value, list) and (name in JOINED or not has(hint, list)):
         values = [",".join(map(str, value))]
     return [word for one in values for word in (f"--{name}", _text(path, name, one, hint))]
 
@@ -93,12 +93,12 @@ def _text(path: Path, name: str, value: object, hint: Any) -> str:
     """A value as a word; files relative to the folder of the campaign."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise InputError.of(f"{path}: {name}", expected="text or a number", got=as_written(value))
-    return str(path.parent / str(value)) if _has(hint, Path) else str(value)
+    return str(path.parent / str(value)) if has(hint, Path) else str(value)
 
 
-def _has(hint: Any, part: type) -> bool:
+def has(hint: Any, part: type) -> bool:
     """Whether a type, or a part of it, is this one."""
-    return part in {hint, get_origin(hint)} or any(_has(one, part) for one in get_args(hint))
+    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
 
 
 OPTION = "--jobs"

@@ -6,14 +6,7 @@ from math import degrees
 from pathlib import Path
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
-from diffeo_calib.cli.commands.recalibrate import (
-    change_lines,
-    changes_entry,
-    doubt,
-    offsets_entry,
-    smallest_entry,
-    smallest_lines,
-)
+from diffeo_calib.cli.commands.recalibrate import change_entries, change_lines, doubt, smallest_lines
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.declarations import CompareOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
@@ -49,9 +42,7 @@ def run(given: CompareOptions) -> None:
     if not isinstance(found, Comparison):
         return None
     record.add(
-        changes=changes_entry(found.changes),
-        smallest_offsets=smallest_entry(found.changes),
-        possible_offsets=offsets_entry(found.hidden),
+        **change_entries(found.changes, found.hidden),
         rows_can_tell=found.telling and found.changes.tested,
         **({} if found.moved is None else {"transform": found.moved.transform}),
         **entries_by_kind(
@@ -81,7 +72,7 @@ def _models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         expected_m=found.expected,
         largest_m=found.largest,
         geodesic_length=found.geodesic_length,
-        changes=changes_entry(found.changes),
+        changes=change_entries(found.changes)["changes"],
         transmissions_rad_or_m=found.transmissions,
         files={} if figure is None else {"figure": figure},
     )

@@ -34,10 +34,8 @@ def run(given: RecalibrateOptions) -> None:
         result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
-        changes=changes_entry(result.changes),
+        **change_entries(result.changes, result.hidden),
         rows_can_tell=result.changes.tested,
-        smallest_offsets=smallest_entry(result.changes),
-        possible_offsets=offsets_entry(result.hidden),
         markers=result.marker,
         **({} if result.moved is None else {"transform": result.moved.transform}),
         converged=result.fit.converged,
@@ -92,17 +90,20 @@ def doubt(changes: Changes, where: str) -> str:
     return "" if changes.tested else f": a change of the robot, which was not tested, would be {where}"
 
 
-def changes_entry(changes: Changes) -> list[dict[str, object]]:
-    """Changes for programs."""
-    return [
-        {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
-        for one in changes.found
-    ]
-
-
-def offsets_entry(hidden: Sequence[HiddenOffset]) -> list[dict[str, object]]:
-    """Offsets that explain new places of device or markers as well, for programs."""
-    return [{"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden]
+def change_entries(changes: Changes, hidden: Sequence[HiddenOffset] = ()) -> dict[str, list[dict[str, object]]]:
+    """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
+    return {
+        "changes": [
+            {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
+            for one in changes.found
+        ],
+        "smallest_offsets": [
+            {"joint": one.joint, "size_rad_or_m": one.size if isfinite(one.size) else None} for one in changes.smallest
+        ],
+        "possible_offsets": [
+            {"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden
+        ],
+    }
 
 
 def change_lines(changes: Changes) -> list[str]:
@@ -116,8 +117,3 @@ def smallest_lines(changes: Changes) -> list[str]:
         return []
     listed = ", ".join(map(str, changes.smallest))
     return [f"smallest change of an offset that these rows would show in nine cases of ten: {listed}"]
-
-
-def smallest_entry(changes: Changes) -> list[dict[str, object]]:
-    """The same for programs; None where places hide it."""
-    return [{"joint": one.joint, "size_rad_or_m": one.size if isfinite(one.size) else None} for one in changes.smallest]
