@@ -80,31 +80,25 @@ LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit
 
 
 @dataclass(frozen=True, kw_only=True)
-class Format:
-    """How tables are written, but for their units and marks."""
+class StoredUnits:
+    """How tables are written, for commands with a model, which may know it."""
 
+    length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
+    angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
     joints: str | None = option("Joint columns in the robot's order, if not named after its joints.", "A,B,...")
+    sep: str | None = option(f"{SEP}, {AS_STORED}.")
+    decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Units(Format):
-    """The same with units, which must be stated, and marks."""
+class Units(StoredUnits):
+    """The same where units must be stated."""
 
     length: Length = option(f"{LENGTH}.", default=...)
     angle: Angle = option(f"{ANGLE}.", default=...)
     sep: str = option(f"{SEP}.", default=",")
     decimal: str = option(f"{DECIMAL}.", default=".")
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredUnits(Format):
-    """The same for commands with a model, which may know them."""
-
-    length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
-    angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
-    sep: str | None = option(f"{SEP}, {AS_STORED}.")
-    decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line, leaves_of, names_of
 from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Format, Rows, StoredUnits, Targets, Units
+from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -149,12 +149,12 @@ def stated_units(units: StoredUnits) -> Units:
     return Units(**given)
 
 
-def _options_of(group: type[Format] | type[Rows]) -> dict[str, tuple[str, Any]]:
+def _options_of(group: type[StoredUnits] | type[Rows]) -> dict[str, tuple[str, Any]]:
     """Option -> name and type of its field."""
     return {names_of(field)[0]: (name, hint) for name, (hint, field) in leaves_of(group)}
 
 
-def _read_options(words: Sequence[str], group: type[Format] | type[Rows]) -> dict[str, list[str]]:
+def _read_options(words: Sequence[str], group: type[StoredUnits] | type[Rows]) -> dict[str, list[str]]:
     """Option of a group -> its words in a command line."""
     found: dict[str, list[str]] = {}
     options = _options_of(group)
