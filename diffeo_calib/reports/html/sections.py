@@ -143,7 +143,7 @@ def where(found: Findings) -> Section:
         f"{rough_millimetres(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
         f"ranges {printable(error.sentence)}"
     )
-    if found.model.map.workspace is not None:
+    if found.model.own_frame:
         see += ", after a rigid fit, because no device says where the robot stands"
     rows = [[name, millimetres(value)] for name, value in found.expected.items()]
     table = Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)
