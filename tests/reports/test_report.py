@@ -33,6 +33,7 @@ POSITION = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
 
 def made(path: Path, model: dc.CalibratedKinematics, data: dc.Measurements | None = None, **options: str) -> Findings:
     found = dc.write_report(model, path, data, **options)  # pyright: ignore[reportArgumentType]
+    assert isinstance(found, Findings)
     check_page(path.read_text(encoding="utf-8"))
     return found
 
