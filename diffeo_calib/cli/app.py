@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import inspect
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
@@ -19,8 +20,6 @@ from diffeo_calib.cli import campaign
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import printable, warn_user
 
-Command = TypeVar("Command", bound=Callable[..., None])
-
 MASS, FREEDOM = {"--payload": "--payload-mass"}, {"--marker": "--marker-freedom"}
 RENAMED = {
     **{"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}},
@@ -28,6 +27,8 @@ RENAMED = {
 }
 """Command -> former names of options, which had another meaning in other commands, and their names."""
 
+DECLARED: dict[str, dict[str, Any]] = {}
+"""Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
 """Of the command that runs."""
 _renamed: list[str] = []
@@ -59,13 +60,9 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        options_of_fit, of_campaign = (
-            [option.removeprefix("--") for one in self.commands[name].params for option in one.opts]
-            for name in (campaign.COMMAND, campaign.LIVE)
-        )
-        if (several := campaign.asked(args, options_of_fit)) is not None:
+        if (several := campaign.asked(args, DECLARED)) is not None:
             raise typer.Exit(campaign.run(several))
-        _arguments[:], _renamed[:] = _with_names(campaign.expanded(args, options_of_fit, of_campaign))
+        _arguments[:], _renamed[:] = _with_names(campaign.expanded(args, DECLARED))
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -122,48 +119,82 @@ Json = Annotated[
 ]
 
 
-def command(name: str) -> Callable[[Command], Command]:
-    """Declare a command; parameters whose type is a dataclass are groups of options, and every command has --json."""
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
-    def declare(function: Command) -> Command:
-        hints = inspect.get_annotations(function, eval_str=True)  # get_type_hints of 3.10 hides options of None
-        groups: dict[str, Any] = {key: hint for key, hint in hints.items() if is_dataclass(hint)}
+    def check(self) -> None:
+        """Refuse options that do not belong together."""
 
-        def run(**given: Any) -> None:
-            del given["_json"]
-            for key, group in groups.items():
-                given[key] = group(**{field.name: given.pop(field.name) for field in fields(group)})
-            function(**given)
+    @property
+    def beside(self) -> dict[str, Path]:
+        """Files that are written beside those that options name."""
+        return {}
 
-        parameters = [
-            inspect.Parameter(one, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for one, annotation, default in _flat(function, hints)
-        ]
-        run.__name__, run.__doc__ = function.__name__, function.__doc__
+
+Options = TypeVar("Options", bound=Command)
+
+
+def command(name: str) -> Callable[[type[Options]], type[Options]]:
+    """Declare a command by the class of its options, whose fields may be groups of more; every command has --json."""
+
+    def declare(plain: type[Options]) -> type[Options]:
+        options = dataclass(frozen=True, kw_only=True)(plain)
+        leaves = dict(leaves_of(options))
+        named = {one: hint for hint, field in leaves.values() for one in names_of(field)} | {"--json": Path}
+        DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
+
+        def run(_json: Any, **given: Any) -> None:
+            made = _made(options, given)
+            made.check()
+            files: dict[str, dict[str, Path]] = {"write": dict(made.beside), "read": {}, "appended": {}, "folder": {}}
+            for key, (_, field) in leaves.items():
+                for path in given[key] if isinstance(given[key], list) else [given[key]]:
+                    if isinstance(path, Path):
+                        shown = names_of(field)[0] + f" {path}" * isinstance(given[key], list)
+                        files[field.metadata["file"]][shown] = path
+            check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
+            import_module(f"diffeo_calib.cli.commands.{name}").run(made)
+
+        json = inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json)
+        parameters = [*(_parameter(hint, field) for hint, field in leaves.values()), json]
+        run.__name__, run.__doc__ = f"{name}_command", plain.__doc__
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         vars(run)["__signature__"] = inspect.Signature(parameters)
         app.command(name)(run)
-        return function
+        return options
 
     return declare
 
 
-def _flat(function: Callable[..., None], hints: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Name, type and default of the parameters of a command, those of its groups among them."""
-    found: list[tuple[str, Any, Any]] = []
-    for key, parameter in inspect.signature(function).parameters.items():
-        if not is_dataclass(hints[key]):
-            found.append((key, hints[key], parameter.default))
-            continue
-        own = get_type_hints(hints[key], include_extras=True)
-        for field in fields(hints[key]):
-            default = inspect.Parameter.empty if field.default is MISSING else field.default
-            said, annotation = dict(field.metadata), own[field.name]
-            if said:
-                names = said.pop("names") or (f"--{field.name.replace('_', '-')}",)
-                annotation = Annotated[annotation, typer.Option(*names, **said)]
-            found.append((field.name, annotation, default))
-    return [*found, ("_json", Json, None)]
+def leaves_of(group: Any) -> Iterator[tuple[str, tuple[Any, Field[Any]]]]:
+    """Name, type and field of the options of a group and of the groups in it."""
+    hints = get_type_hints(group)
+    for field in fields(group):
+        own = hints[field.name]
+        yield from leaves_of(own) if is_dataclass(own) else [(field.name, (own, field))]
+
+
+def names_of(field: Field[Any]) -> tuple[str, ...]:
+    """What the user types for an option, or reads for an argument."""
+    if field.metadata["made"] is typer.Argument:
+        return (field.metadata["how"]["metavar"],)
+    return field.metadata["names"] or (f"--{field.name.replace('_', '-')}",)
+
+
+def _parameter(hint: Any, field: Field[Any]) -> inspect.Parameter:
+    """A field as typer reads it."""
+    names = names_of(field) if field.metadata["made"] is typer.Option else ()
+    annotation = Annotated[hint, field.metadata["made"](*names, **field.metadata["how"])]
+    default = inspect.Parameter.empty if field.default is MISSING else field.default
+    return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _made(group: Any, given: dict[str, Any]) -> Any:
+    """A group of options, and the groups in it, from the values of all."""
+    hints = get_type_hints(group)
+    names = [field.name for field in fields(group)]
+    return group(**{name: _made(hints[name], given) if is_dataclass(hints[name]) else given[name] for name in names})
 
 
 def _print_version(wanted: bool) -> None:

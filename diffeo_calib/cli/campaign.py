@@ -17,11 +17,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, get_args, get_origin
 
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, say, show_error
 from diffeo_calib.common.errors import InputError, as_written
@@ -33,49 +33,44 @@ else:
 
 SUFFIX = ".toml"
 COMMAND, LIVE = "fit", "campaign"
-PATHS = ("csv", "robot", "output", "figure", "report", "json", "candidates", "accepted")
-"""Entries that name files."""
-REPEATED = ("position", "tip", "load", "distance", "rotation", "reading")
-"""Entries that may be lists: one option for each value."""
+JOINED = ("rotation-std",)
+"""Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
 
 
-def expanded(arguments: Sequence[str], known: Sequence[str], live: Sequence[str] = ()) -> list[str]:
-    """The same command line with a campaign file written out; unchanged without one.
+Known = Mapping[str, Mapping[str, Any]]
+"""Command -> name of an option, without dashes, or of an argument -> type of its value."""
 
-    Args:
-        arguments: of the program. known: names of the options of `fit`, without dashes.
-        live: the same of `campaign`, which leaves out entries of `fit` alone.
-    """
+
+def expanded(arguments: Sequence[str], known: Known) -> list[str]:
+    """The same command line with a campaign file written out, for `campaign` without what only `fit` knows."""
     words = list(arguments)
     at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
     if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):
         return words
     path = Path(words[at + 1])
-    entries = _read(path)
-    if words[at] == LIVE:
-        only_of_fit = {*known} - {*live}
-        entries = {name: value for name, value in entries.items() if name.replace("_", "-") not in only_of_fit}
-        known = live
-    names = [name.replace("_", "-") for name in entries]
-    unknown = [name for name in names if name not in (*known, "csv")]
+    options = known[words[at]]
+    entries = {name: value for name, value in _read(path).items() if name in options or name not in known[COMMAND]}
+    unknown = [name for name in entries if name not in options]
     if unknown:
-        expected = f"options of `{words[at]}`: csv, {', '.join(known)}"
+        expected = f"options of `{words[at]}`: {', '.join(options)}"
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")
-    if "csv" not in names:
+    if "csv" not in entries:
         raise InputError.of(f"{path} has no entry csv", fix='add csv = "measurements.csv", the table to calibrate with')
     typed = {word.removeprefix("--").partition("=")[0] for word in words[at + 2 :] if word.startswith("--")}
-    kept = {name: value for name, value in zip(names, entries.values(), strict=True) if name not in typed}
-    options = [word for name, value in kept.items() for word in _words(path, name, value)]
-    return [*words[: at + 1], _text(path, "csv", entries["csv"]), *options, *words[at + 2 :]]
+    table = _text(path, "csv", entries.pop("csv"), options["csv"])
+    kept = {name: value for name, value in entries.items() if name not in typed}
+    written = [word for name, value in kept.items() for word in _words(path, name, value, options[name])]
+    return [*words[: at + 1], table, *written, *words[at + 2 :]]
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LONGEST_FILE:
             raise InputError.of(f"{path}", expected="a file of options", got="more than 1 MiB")
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        entries = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return {name.replace("_", "-"): value for name, value in entries.items()}
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -84,21 +79,26 @@ def _read(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _words(path: Path, name: str, value: object) -> list[str]:
+def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
     """One entry as words of a command line."""
-    option, values = "--" + name, value if isinstance(value, list) else [value]
-    if name == "csv" or isinstance(value, bool):
-        return [option] if value is True else []
-    if name not in REPEATED and isinstance(value, list):
+    if isinstance(value, bool):
+        return [f"--{name}"] * value
+    values = value if isinstance(value, list) else [value]
+    if isinstance(value, list) and (name in JOINED or not has(hint, list)):
         values = [",".join(map(str, value))]
-    return [word for one in values for word in (option, _text(path, name, one))]
+    return [word for one in values for word in (f"--{name}", _text(path, name, one, hint))]
 
 
-def _text(path: Path, name: str, value: object) -> str:
+def _text(path: Path, name: str, value: object, hint: Any) -> str:
     """A value as a word; files relative to the folder of the campaign."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise InputError.of(f"{path}: {name}", expected="text or a number", got=as_written(value))
-    return str(path.parent / str(value)) if name in PATHS else str(value)
+    return str(path.parent / str(value)) if has(hint, Path) else str(value)
+
+
+def has(hint: Any, part: type) -> bool:
+    """Whether a type, or a part of it, is this one."""
+    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
 
 
 OPTION = "--jobs"
@@ -123,12 +123,8 @@ class Fleet(NamedTuple):
     jobs: int
 
 
-def asked(arguments: Sequence[str], known: Sequence[str]) -> Fleet | None:
-    """The campaigns that a command line names; None where it names one command, or one campaign without --jobs.
-
-    Args:
-        arguments: of the program. known: names of the options of `fit`, without dashes.
-    """
+def asked(arguments: Sequence[str], known: Known) -> Fleet | None:
+    """The campaigns that a command line names; None where it names one command, or one campaign without --jobs."""
     if not arguments or arguments[0] != COMMAND:
         return None
     words, jobs = _without_jobs(list(arguments[1:]))
@@ -159,7 +155,7 @@ def _without_jobs(words: list[str]) -> tuple[list[str], int | None]:
     return words, None
 
 
-def _check_outputs(campaigns: Sequence[str], options: Sequence[str], known: Sequence[str]) -> None:
+def _check_outputs(campaigns: Sequence[str], options: Sequence[str], known: Known) -> None:
     """Read every campaign before any runs."""
     writers: dict[str, str] = {}
     for campaign in campaigns:

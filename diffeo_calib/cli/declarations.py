@@ -1,41 +1,48 @@
-"""The commands, as the command line declares them. Each imports its work when it runs.
-
-Help, the version and shell completion therefore load neither torch nor SciPy and appear at once.
-"""
+"""The commands: their options, as fields of a class, and their help, as its docstring. Imports nothing slow."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Literal
 
 import typer
 
-from diffeo_calib.cli import options
-from diffeo_calib.cli.app import app, command
-from diffeo_calib.cli.record import check_outputs, make_folder
+from diffeo_calib.cli.app import Command, command
+from diffeo_calib.cli.options import (
+    CONVENTION,
+    LARGEST_SEED,
+    PAYLOAD,
+    ROTATION_ANGLE,
+    Angle,
+    Candidates,
+    ChangeTests,
+    Frame,
+    Length,
+    Robot,
+    Rows,
+    StoredUnits,
+    Targets,
+    Units,
+    argument,
+    option,
+    output,
+    written,
+)
 from diffeo_calib.common.errors import InputError
+
+ToolFrom = Literal["tip", "measured"]
+Free = Literal["both", "base", "marker"]
+"""Parts of the set-up that may have moved."""
+CSV = "Table with a header, one configuration per row."
+MODEL = "Model file written by `fit`."
+NOTE = "Text to keep in the model file, such as a serial number."
+MASS = "Mass that the robot carries, for a model with payloads."
+TOOL_FROM = "Frame of --tool: the tip of the robot, or the measured frame of a model of poses, which is better known."
 
 
 @command("fit")
-def fit_command(
-    csv: options.CsvPath,
-    robot: options.Robot,
-    units: options.Units,
-    output: options.ModelOutput,
-    rows: options.Rows,
-    given: options.FitOptions,
-    duplicates: Annotated[
-        str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")
-    ] = "error",
-    _jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs",
-            metavar="N",
-            help="With several campaign files: how many run at a time; the exit code counts those that failed.",
-        ),
-    ] = None,
-) -> None:
+class FitOptions(Command):
     """Calibrate a robot, test it on held-out rows, save the model.
 
     Rows may hold anything that was measured: positions, poses, a ball in sockets, readings of devices. The model is
@@ -44,23 +51,35 @@ def fit_command(
     A campaign file (`diffeo-calib fit campaign.toml`, see `init`) may take the place of CSV: it can hold all options,
     the required ones too; those that are typed as well win.
     """
-    outputs = {"-o": output, "--figure": given.figure, "--report": given.report}
-    others = given.scales_of or []
-    check_outputs(outputs, {"CSV": csv, "--robot": robot.robot} | {f"--scales-of {other}": other for other in others})
-    from diffeo_calib.cli.commands import fit  # noqa: PLC0415
-    from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    fit.run(robot, measured_table(csv, rows, units, duplicates), output, given)
+    csv: Path = argument("CSV", CSV)
+    robot: Robot
+    units: Units
+    output: Path = output("Model file to write.", "MODEL")
+    rows: Rows
+    holdout: float = option(
+        "Fraction of the rows that are not fitted but test the model; 0 for none.", min=0.0, max=0.9, default=0.3
+    )
+    seed: int = option("Seed of the split.", min=0, max=LARGEST_SEED, default=0)
+    controls: int | None = option(
+        "Number of rows that carry the deformation; by default all, or 200 of a large table.", min=10
+    )
+    figure: Path | None = written("Also draw the errors (of the held-out rows, if any).", "IMAGE")
+    report: Path | None = written("Also write the report: one page that needs neither a network nor a server.", "HTML")
+    note: str = option(NOTE, "TEXT", default="")
+    scales_of: list[Path] | None = option(
+        "For few rows: take the size of every kind of error, and of the noise, from the model of another robot of the "
+        "same type instead of estimating it. May be repeated.",
+        "MODEL",
+    )
+    duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
+    jobs: int | None = option(
+        "With several campaign files: how many run at a time; the exit code counts those that failed.", "N"
+    )
 
 
 @command("campaign")
-def campaign_command(
-    csv: options.CsvPath,
-    robot: options.Robot,
-    units: options.Units,
-    rows: options.Rows,
-    given: options.LiveOptions,
-) -> None:
+class CampaignOptions(Command):
     """Judge rows while they are measured.
 
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and the
@@ -70,39 +89,39 @@ def campaign_command(
     A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
     options, the required ones too; those that are typed as well win.
     """
-    bag = {} if given.bag is None else {"--bag": given.bag}
-    check_outputs({"--accepted": given.accepted}, {"CSV": csv, "--robot": robot.robot, **bag}, may_come="CSV")
-    if (given.bag is None) != (given.seen is None):
-        raise InputError.of("--bag and --seen belong together", fix="name both, or none")
-    if given.bag is not None and (given.once or given.stdin):
-        raise InputError.of("--once and --stdin beside --bag, whose end is that of the campaign", fix="leave them out")
-    from diffeo_calib.cli.commands import campaign  # noqa: PLC0415
-    from diffeo_calib.cli.tables import measured_table  # noqa: PLC0415
 
-    campaign.run(robot, measured_table(csv, rows, units), given)
+    csv: Path = argument("CSV", CSV, file="appended")
+    robot: Robot
+    units: Units
+    rows: Rows
+    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
+    stdin: bool = option(
+        "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.",
+        default=False,
+    )
+    json_lines: bool = option(
+        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
+    )
+    bag: Path | None = option("Append the stops of a ROS 2 bag to CSV, at their times; see `record`.", "BAG")
+    seen: str | None = option("Topic of --bag: stamped points, poses or transforms that a device measured.", "TOPIC")
+    joint_states: str = option("Topic of --bag: joint states.", "TOPIC", default="/joint_states")
+    speed: float = option("How many times faster --bag is played than it was recorded.", min=1e-3, default=1.0)
+    once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
+    candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
+    page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
+    next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
+    accepted: Path | None = written("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
+
+    def check(self) -> None:
+        if (self.bag is None) != (self.seen is None):
+            raise InputError.of("--bag and --seen belong together", fix="name both, or none")
+        if self.bag is not None and (self.once or self.stdin):
+            what = "--once and --stdin beside --bag, whose end is that of the campaign"
+            raise InputError.of(what, fix="leave them out")
 
 
 @command("record")
-def record_command(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="Folder of a ROS 2 bag.")],
-    seen: Annotated[
-        str,
-        typer.Option(
-            "--seen", metavar="TOPIC", help="Stamped points, poses or transforms that a device measured; or images."
-        ),
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table to write.")],
-    joints: Annotated[str, typer.Option("--joints", metavar="TOPIC", help="Joint states.")] = "/joint_states",
-    still: Annotated[float, typer.Option("--still", min=1e-9, help="Largest motion of a joint at a stop.")] = 1e-3,
-    shortest: Annotated[float, typer.Option("--shortest", min=0.01, help="Shortest stop in seconds.")] = 0.5,
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            "--offset",
-            help="Seconds to add to the times of --seen; by default estimated from all motions, 0 for images.",
-        ),
-    ] = None,
-) -> None:
+class RecordOptions(Command):
     """Turn a ROS 2 bag into a table, one row for each stop.
 
     A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
@@ -112,117 +131,108 @@ def record_command(
     Of images, the one nearest to the middle of each stop is written beside the table, which then has its name and the
     joint values for `images`.
     """
-    check_outputs({"-o": output}, {})
-    from diffeo_calib.cli.commands import record  # noqa: PLC0415
 
-    record.run(bag, (joints, seen), output, record.StopLimits(joints=still, shortest=shortest), offset)
+    bag: Path = argument("BAG", "Folder of a ROS 2 bag.")
+    seen: str = option("Stamped points, poses or transforms that a device measured; or images.", "TOPIC", default=...)
+    output: Path = output("Table to write.", "CSV")
+    joints: str = option("Joint states.", "TOPIC", default="/joint_states")
+    still: float = option("Largest motion of a joint at a stop.", min=1e-9, default=1e-3)
+    shortest: float = option("Shortest stop in seconds.", min=0.01, default=0.5)
+    offset: float | None = option(
+        "Seconds to add to the times of --seen; by default estimated from all motions, 0 for images."
+    )
 
 
 @command("evaluate")
-def evaluate_command(
-    model: options.ModelPath,
-    csv: options.CsvPath,
-    units: options.StoredUnits,
-    rows: options.Rows,
-    given: options.EvaluateOptions,
-) -> None:
+class EvaluateOptions(Command):
     """Measure the errors of a model on a table of measurements.
 
     The table is read as that of the model's fit, unless options say otherwise. --register first finds where the
     measuring device and the markers are now, and keeps everything else.
     """
-    if not given.register and not (given.free is None and given.output is None):
-        raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
-    if given.register and not (given.fail_above is None and given.residuals is None):
-        fix = "write the registered model with -o, and evaluate that"
-        raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
-    check_outputs({"-o": given.output, "--residuals": given.residuals}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
 
-    evaluate.run(model, options.TableOptions(csv, rows, units), given)
+    model: Path = argument("MODEL", MODEL)
+    csv: Path = argument("CSV", CSV)
+    units: StoredUnits
+    rows: Rows
+    register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
+    free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
+    output: Path | None = output("With --register: write the registered model to this file.", "MODEL", default=None)
+    fail_above: str | None = option(
+        "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
+    )
+    residuals: Path | None = written("Write the error of every row to this file: measured minus predicted.", "TABLE")
+
+    def check(self) -> None:
+        if not self.register and not (self.free is None and self.output is None):
+            raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
+        if self.register and not (self.fail_above is None and self.residuals is None):
+            fix = "write the registered model with -o, and evaluate that"
+            raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
 
 
 @command("init")
-def init_command(
-    csv: options.CsvPath,
-    urdf: Annotated[Path, typer.Argument(metavar="URDF", help="The robot's description.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="TOML", help="Campaign file to write.")] = Path(
-        "campaign.toml"
-    ),
-    force: Annotated[bool, typer.Option("--force", help="Replace a campaign file that was edited.")] = False,
-) -> None:
+class InitOptions(Command):
     """Propose the options of `fit` for a table and a URDF.
 
     Looks at names, numbers and plausible units, and writes a campaign file with a reason for every line. Check it, then
     run `diffeo-calib fit campaign.toml`.
     """
-    check_outputs({"-o": output}, {"CSV": csv, "URDF": urdf})
-    from diffeo_calib.cli.commands import init  # noqa: PLC0415
 
-    init.run(csv, urdf, output, force=force)
+    csv: Path = argument("CSV", CSV)
+    urdf: Path = argument("URDF", "The robot's description.")
+    output: Path = output("Campaign file to write.", "TOML", Path("campaign.toml"))
+    force: bool = option("Replace a campaign file that was edited.", default=False)
 
 
 @command("images")
-def images_command(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER", help="Folder of the images, or one of each camera.")
-    ],
-    joints: Annotated[
-        Path,
-        typer.Argument(
-            metavar="JOINTS",
-            help="Table of joint values, with a column of file names unless rows are in their order.",
-        ),
-    ],
-    given: options.BoardImages,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table of corners to write.")],
-) -> None:
+class ImagesOptions(Command):
     """Find a printed board in a folder of images.
 
     Writes a line for each corner, and beside the table a file .yaml of the camera, for `fit --reading corners=FILE`.
     Several fixed cameras that see the same board: a folder and a file for each, named after it. Images that do not show
     the board are named with the reason and left out.
     """
-    inputs = {"JOINTS": joints} | {f"FOLDER {folder}": folder for folder in folders}
-    check_outputs({"-o": output, "--overview": given.overview}, inputs)
-    from diffeo_calib.cli.commands import images  # noqa: PLC0415
 
-    images.run(folders, joints, given, output)
+    folders: list[Path] = argument("FOLDER", "Folder of the images, or one of each camera.")
+    joints: Path = argument(
+        "JOINTS", "Table of joint values, with a column of file names unless rows are in their order."
+    )
+    board: str = option(
+        "Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner "
+        "corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
+        "BOARD",
+        default=...,
+    )
+    length: Length = option("Unit of places on the board in the output.", default=...)
+    board_std: float = option(
+        "Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured.", default=1e-3
+    )
+    overview: Path | None = written("Write a page with all images and their corners.", "HTML")
+    sep: str = option("Separator of both tables.", default=",")
+    decimal: str = option("Decimal mark of both tables.", default=".")
+    output: Path = output("Table of corners to write.", "CSV")
 
 
 @command("predict")
-def predict_command(
-    model: options.ModelPath,
-    csv: options.CsvPath,
-    units: options.StoredUnits,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table of predictions to write.")],
-    convention: options.Convention = None,
-    rotation_angle: options.RotationAngle = None,
-    payload: options.PayloadColumn = None,
-) -> None:
+class PredictOptions(Command):
     """Predict positions or poses for a table of joint values.
 
     Writes the joints, the positions, and the standard deviations that a new measurement would have. For a model that
     was calibrated with poses it adds the rotation, by default as a rotation vector in the unit of --angle.
     """
-    check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli.commands import predict  # noqa: PLC0415
 
-    rows = options.Rows(convention=convention, rotation_angle=rotation_angle, payload=payload)
-    predict.run(model, options.TableOptions(csv, rows, units), output)
+    model: Path = argument("MODEL", MODEL)
+    csv: Path = argument("CSV", CSV)
+    units: StoredUnits
+    output: Path = output("Table of predictions to write.", "CSV")
+    convention: str | None = option(CONVENTION)
+    rotation_angle: Angle | None = option(ROTATION_ANGLE)
+    payload: str | None = option(PAYLOAD, "COLUMN")
 
 
 @command("correct")
-def correct_command(
-    model: options.ModelPath,
-    program: Annotated[
-        Path,
-        typer.Argument(metavar="PROGRAM", help="Table with a header, one command per row; other columns are kept."),
-    ],
-    units: options.StoredUnits,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")],
-    given: options.Correction,
-) -> None:
+class CorrectOptions(Command):
     """Correct a program, so that the robot goes where it is told.
 
     The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
@@ -237,117 +247,167 @@ def correct_command(
     With several tips the added columns carry their names (command_left_x, ...), and a tip whose target cells are empty
     may be anywhere in that row.
     """
-    check_outputs({"-o": output}, {"MODEL": model, "PROGRAM": program})
-    from diffeo_calib.cli.commands import correct  # noqa: PLC0415
 
-    correct.run(model, program, units, given, output)
+    model: Path = argument("MODEL", MODEL)
+    program: Path = argument("PROGRAM", "Table with a header, one command per row; other columns are kept.")
+    units: StoredUnits
+    output: Path = output("Corrected program to write.", "CSV")
+    targets: Targets
+    tip: list[str] | None = option(
+        "Link that carries the tool, for a model with several tips; repeat it where several tools have "
+        "targets at the same time, with --tool, --position and --rotation once for each.",
+        "LINK",
+    )
+    tool: list[str] | None = option(
+        "Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is "
+        "turned: a rotation vector in the unit of --angle, or as --convention says. By default the tip itself, or "
+        "the tool that the model was saved with.",
+        "X,Y,Z[,...]",
+    )
+    tool_from: ToolFrom = option(TOOL_FROM, default="tip")
+    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default="base")
+    limit: float | None = option(
+        "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
+    )
+    rate: float | None = option(
+        "The rows are a path: the correction of a joint changes by at most this many degrees from row to row.", "DEG"
+    )
+    payload_mass: float | None = option(MASS, "MASS")
 
 
 @command("export")
-def export_command(
-    model: options.ModelPath,
-    given: options.Export,
-) -> None:
+class ExportOptions(Command):
     """Write a model in the formats of other programs.
 
     Name at least one file. A table says how far each is from the model: rigid kinematics hold neither gravity sag nor
     transmission errors, correction tables hold transmission errors only. Programs (--c, --torch, --onnx) hold the whole
     model.
     """
-    outputs = given.outputs
-    wanted = {option for option, target in outputs.items() if target is not None}
-    if not wanted:
-        raise typer.BadParameter(f"name at least one file to write: {', '.join(outputs)}")
-    if given.with_tables and not ("--correction-tables" in wanted and wanted & {"--urdf", "--dh", "--ur-kinematics"}):
-        raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
-    if given.ur_hash is not None and "--ur-kinematics" not in wanted:
-        raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
-    if given.tip and not wanted & {"--c", "--dh"}:
-        raise typer.BadParameter("--tip belongs to --c and --dh: the other files hold all tips")
-    if (given.tool or given.frame) and not wanted & {"--c", "--torch", "--onnx"}:
-        raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")
-    header = {"--c (its header)": None if given.c is None else given.c.with_suffix(".h")}
-    files = {name: path for name, path in outputs.items() if name != "--camera"}
-    check_outputs(files | header, {"MODEL": model} | ({} if given.robot is None else {"--robot": given.robot}))
-    from diffeo_calib.cli.commands import export  # noqa: PLC0415
 
-    export.run(model, given)
+    model: Path = argument("MODEL", MODEL)
+    urdf: Path | None = written("Write the robot's own URDF with corrected joint origins.", "URDF")
+    mjcf: Path | None = written("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
+    dh: Path | None = written("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
+    dh_convention: Literal["standard", "craig"] = option(
+        "Convention of --dh; craig is also called modified.", default="standard"
+    )
+    ur_kinematics: Path | None = written("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
+    ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
+    joint_offsets: Path | None = written("Write the best joint offsets, all other geometry nominal.", "CSV")
+    correction_tables: Path | None = written("Write transmission errors and their corrections by joint value.", "CSV")
+    with_tables: bool = option(
+        "Fit --urdf, --mjcf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
+    )
+    c: Path | None = written("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
+    torch: Path | None = written("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
+    onnx: Path | None = written("The same for onnxruntime; needs the packages onnx and onnxscript.", "ONNX")
+    camera: Path | None = option(
+        "Write the camera of a model of images: intrinsics (OpenCV, ROS camera_info), hand-eye transform, URDF joint, "
+        "static transform; its place belongs to --urdf, --dh or --ur-kinematics if these are written too.",
+        "FOLDER",
+        file="folder",
+    )
+    tool: str | None = option(
+        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and a "
+        "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
+        "X,Y,Z[,...]",
+    )
+    tool_from: ToolFrom = option(TOOL_FROM, default="tip")
+    frame: Frame | None = option(
+        "Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the "
+        "measuring device."
+    )
+    tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
+    robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
+    payload_mass: float | None = option(MASS, "MASS")
+    length: Length = option("Unit of lengths in the CSV files written.", default="m")
+    angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
+
+    @property
+    def outputs(self) -> dict[str, Path | None]:
+        """Option -> file to write, None where it is not wanted."""
+        own = [field for field in fields(self) if field.metadata["file"] in ("write", "folder")]
+        return {f"--{field.name.replace('_', '-')}": getattr(self, field.name) for field in own}
+
+    @property
+    def beside(self) -> dict[str, Path]:
+        """The header of C."""
+        return {} if self.c is None else {"--c (its header)": self.c.with_suffix(".h")}
+
+    def check(self) -> None:
+        wanted = {option for option, target in self.outputs.items() if target is not None}
+        if not wanted:
+            raise typer.BadParameter(f"name at least one file to write: {', '.join(self.outputs)}")
+        rigid = {"--urdf", "--dh", "--ur-kinematics"}
+        if self.with_tables and not ("--correction-tables" in wanted and wanted & rigid):
+            raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
+        if self.ur_hash is not None and "--ur-kinematics" not in wanted:
+            raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
+        if self.tip and not wanted & {"--c", "--dh"}:
+            raise typer.BadParameter("--tip belongs to --c and --dh: the other files hold all tips")
+        if (self.tool or self.frame) and not wanted & {"--c", "--torch", "--onnx"}:
+            raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")
 
 
 @command("plan")
-def plan_command(
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="Number of poses to plan.")],
-    units: options.StoredUnits,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="CSV", help="Table of poses to write: the joints, and a rank.")
-    ],
-    cell: options.Candidates,
-    given: options.Planned,
-    model: Annotated[
-        Path | None,
-        typer.Argument(metavar="MODEL", help="Model file written by `fit`, to plan the next poses; or name a --robot."),
-    ] = None,
-) -> None:
+class PlanOptions(Command):
     """Plan which poses to measure, and say how many are needed.
 
     With --robot the first poses of a calibration, with a MODEL the next ones, and with --free those to measure again
     later. Lengths are in the unit of --length, angles in that of --angle; tables have the columns that `fit` reads.
     """
-    inputs = {"MODEL": model, "--robot": given.robot, "--candidates": cell.candidates}
-    inputs |= {"--target-poses": given.target_poses, "--measured": given.measured}
-    check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
-    _check_belonging(model, given)
-    _check_draw(cell)
-    from diffeo_calib.cli.commands import plan  # noqa: PLC0415
 
-    plan.run(model, given, cell, units, count=count, output=output)
+    count: int = option("Number of poses to plan.", names=("-n", "--count"), min=1, default=...)
+    units: StoredUnits
+    output: Path = output("Table of poses to write: the joints, and a rank.", "CSV")
+    cell: Candidates
+    model: Path | None = argument(
+        "MODEL", "Model file written by `fit`, to plan the next poses; or name a --robot.", default=None
+    )
+    robot: Path | None = option("The robot's description, to plan the first poses.", "URDF")
+    base: str | None = option("With --robot: first link of the chain.", "LINK")
+    tip: list[str] | None = option(
+        "With --robot: last link of the chain; the markers are fixed to it. Repeat for more: each has them.", "LINK"
+    )
+    marker: list[str] | None = option(
+        "With --robot: place of a marker in the frame of the tip, in the unit of --length; repeat for more. "
+        "By default 0.1 m beside and 0.1 m in front of the tip.",
+        "X,Y,Z",
+    )
+    target_poses: Path | None = option("Configurations where the robot shall be accurate; by default all.", "CSV")
+    measured: Path | None = option("Configurations that are measured already but not in the model.", "CSV")
+    free: Free | None = option("With MODEL: what has moved since its fit; base is the device's or the robot's.")
+    sensor: list[str] | None = option(
+        "What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, "
+        "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
+        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane of this normal at this "
+        "distance from the base, "
+        "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more. "
+        "Noise is as that of the rows of MODEL.",
+        "KIND[=NUMBERS]",
+    )
+    payload_mass: float | None = option(MASS, "MASS")
 
-
-def _check_belonging(model: Path | None, given: options.Planned) -> None:
-    """Either a model, or a robot with its links."""
-    links = {"--robot": given.robot, "--base": given.base, "--tip": given.tip, "--marker": given.marker}
-    named = [name for name, value in links.items() if value is not None]
-    if model is not None and named:
-        fix = "leave them out: the model knows its robot and its markers"
-        raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)
-    if model is None:
-        missing = [name for name in ("--robot", "--base", "--tip") if links[name] is None]
-        if missing:
+    def check(self) -> None:
+        links = {"--robot": self.robot, "--base": self.base, "--tip": self.tip, "--marker": self.marker}
+        named = [name for name, value in links.items() if value is not None]
+        if self.model is not None and named:
+            fix = "leave them out: the model knows its robot and its markers"
+            raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)
+        missing = [name for name in ("--robot", "--base", "--tip") if name not in named]
+        if self.model is None and missing:
             expected = "a MODEL, or --robot with --base and --tip"
             raise InputError.of("what to plan for", expected=expected, got=f"no {', '.join(missing)}")
-        if given.payload_mass is not None:
-            raise InputError.of(
-                "--payload-mass without a MODEL", fix="leave it out: no sag under a payload is known yet"
-            )
-        if given.free is not None:
+        if self.model is None and self.payload_mass is not None:
+            fix = "leave it out: no sag under a payload is known yet"
+            raise InputError.of("--payload-mass without a MODEL", fix=fix)
+        if self.model is None and self.free is not None:
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
-
-
-def _check_draw(cell: options.Candidates) -> None:
-    """Options of random configurations mean nothing beside a table of candidates."""
-    drawing = {"draw": cell.draw, "range": cell.limits, "tracker": cell.tracker, "floor": cell.floor}
-    drawing |= {"column": cell.column, "collisions": cell.collisions or None}
-    given = [f"--{name}" for name, value in drawing.items() if value is not None]
-    if cell.candidates is not None and given:
-        what = f"{', '.join(given)} beside --candidates: these options are about random configurations"
-        raise InputError.of(what, fix="leave them out, or leave --candidates out")
+        self.cell.check()
 
 
 @command("recalibrate")
-def recalibrate_command(
-    old: options.OldModel,
-    csv: options.CsvPath,
-    units: options.StoredUnits,
-    output: options.ModelOutput,
-    rows: options.Rows,
-    marker: options.Marker = "evidence",
-    drift: Annotated[
-        options.Drift,
-        typer.Option("--drift", help="tested: what a test names may have changed; none: device and markers only."),
-    ] = "tested",
-    seed: options.TestSeed = 0,
-    note: options.Note = "",
-) -> None:
+class RecalibrateOptions(Command):
     """Calibrate a robot anew, starting from an old model.
 
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. The table is
@@ -355,35 +415,21 @@ def recalibrate_command(
     changed in the robot, offsets with signs as `compare` states them, and writes a model that knows old rows and new
     ones.
     """
-    check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
-    from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
 
-    recalibrate.run(
-        old, options.TableOptions(csv, rows, units), output, marker=marker, drift=drift, seed=seed, note=note
+    old: Path = argument("OLD", "Model file of an earlier calibration.")
+    csv: Path = argument("CSV", CSV)
+    units: StoredUnits
+    output: Path = output("Model file to write.", "MODEL")
+    rows: Rows
+    drift: Literal["tested", "none"] = option(
+        "tested: what a test names may have changed; none: device and markers only.", default="tested"
     )
+    tests: ChangeTests
+    note: str = option(NOTE, "TEXT", default="")
 
 
 @command("compare")
-def compare_command(
-    old: options.OldModel,
-    other: Annotated[
-        Path,
-        typer.Argument(metavar="OTHER", help="Table of new measurements, or another model file of the same robot."),
-    ],
-    units: options.StoredUnits,
-    rows: options.Rows,
-    marker: options.Marker = "evidence",
-    level: Annotated[
-        float,
-        typer.Option(
-            "--level", min=0.001, max=0.2, help="Probability that anything is named although nothing changed."
-        ),
-    ] = 0.01,
-    seed: options.TestSeed = 0,
-    figure: Annotated[
-        Path | None, typer.Option("--figure", metavar="IMAGE", help="With a model: draw where the two differ.")
-    ] = None,
-) -> None:
+class CompareOptions(Command):
     """Say what has changed since a calibration.
 
     With a table: a test for every joint, the load and the geometry. It is read as that of the old fit, unless options
@@ -392,57 +438,62 @@ def compare_command(
     0.5 mrad farther in its positive direction than the old model has it at the same reading. The exit code is 0 whether
     or not something has changed: with --json, programs read `changes` and `rows_can_tell`.
     """
-    check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
-    from diffeo_calib.cli.commands import compare  # noqa: PLC0415
 
-    if compare.is_model(other):
-        if rows.named or units.length or units.angle:
-            fix = "leave out the options of tables, or name a table"
-            raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
-        compare.run_models(old, other, seed, figure)
-        return
-    if figure is not None:
-        raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
-    compare.run(old, options.TableOptions(other, rows, units), marker, level, seed)
+    old: Path = argument("OLD", "Model file of an earlier calibration.")
+    other: Path = argument("OTHER", "Table of new measurements, or another model file of the same robot.")
+    units: StoredUnits
+    rows: Rows
+    level: float = option(
+        "Probability that anything is named although nothing changed.", min=0.001, max=0.2, default=0.01
+    )
+    tests: ChangeTests
+    figure: Path | None = written("With a model: draw where the two differ.", "IMAGE")
 
 
 @command("report")
-def report_command(
-    model: options.ModelPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="HTML", help="Page to write.")],
-    units: options.StoredUnits,
-    rows: options.Rows,
-    page: options.Page,
-) -> None:
+class ReportOptions(Command):
     """Write a report about a model, for a browser or a printer.
 
     One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows of --data
     that were used in the fit are left out; the table is read as that of the fit, unless options say otherwise.
     """
-    check_outputs({"-o": output}, {"MODEL": model} | ({} if page.data is None else {"--data": page.data}))
-    from diffeo_calib.cli.commands import report  # noqa: PLC0415
 
-    if page.data is None and (rows.named or units.length or units.angle or page.against):
-        what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
-        raise InputError.of(what, fix="name the table with --data, or leave them out")
-    report.run(model, output, None if page.data is None else options.TableOptions(page.data, rows, units), page)
+    model: Path = argument("MODEL", MODEL)
+    output: Path = output("Page to write.", "HTML")
+    units: StoredUnits
+    rows: Rows
+    data: Path | None = option(
+        "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
+    )
+    title: str = option("Title of the page; the robot by default.", "TEXT", default="")
+    against: list[str] | None = option(
+        "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
+        "names.",
+        "COLUMN",
+    )
+    tolerance: str | None = option(
+        "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
+    )
+
+    def check(self) -> None:
+        if self.data is None and (self.rows.named or self.units.length or self.units.angle or self.against):
+            what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
+            raise InputError.of(what, fix="name the table with --data, or leave them out")
 
 
 @command("demo")
-def demo_command(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write everything to.")
-    ] = Path("demo_output"),
-    rows: Annotated[int, typer.Option("--rows", min=20, help="Number of simulated measurements.")] = 300,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, max=options.LARGEST_SEED, help="Seed of the arm and the noise.")
-    ] = 0,
-) -> None:
+class DemoOptions(Command):
     """Simulate a robot and calibrate it as a user would.
 
     The robot is an elastic six-axis arm, measured by a laser tracker.
     """
-    make_folder(output)
-    from diffeo_calib.cli.commands import demo  # noqa: PLC0415
 
-    app(demo.simulate(output, rows, seed))
+    output: Path = option(
+        "Folder to write everything to.",
+        "FOLDER",
+        names=("-o", "--output"),
+        default=Path("demo_output"),
+        file="folder",
+    )
+    rows: int = option("Number of simulated measurements.", min=20, default=300)
+    seed: int = option("Seed of the arm and the noise.", min=0, max=LARGEST_SEED, default=0)

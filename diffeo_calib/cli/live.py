@@ -14,7 +14,7 @@ from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, as_line, check_cel
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import LiveOptions
+from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
@@ -39,7 +39,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    given: LiveOptions
+    given: CampaignOptions
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)

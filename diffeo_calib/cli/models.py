@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Robot, Rows, StoredUnits, TableOptions, Units
+from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.interop.model_file import load
@@ -74,17 +74,17 @@ def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: StoredUnits
     return as_at_the_fit("" if made is None else made.command or made.table, rows, units)
 
 
-def table_of(model: CalibratedKinematics, given: TableOptions) -> MeasuredTable:
+def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: StoredUnits) -> MeasuredTable:
     """A table of measurements, read as that of the model's fit unless the options say otherwise.
 
     Kinds of rows of the fit that the table has no column of are left out.
     """
-    rows, units = as_fitted(model, given.rows, given.units)
-    if not given.rows.named:
-        rows, missing = rows_in_table(given.csv, rows, units)
+    rows, units = as_fitted(model, typed, typed_units)
+    if not typed.named:
+        rows, missing = rows_in_table(csv, rows, units)
         if missing:
             say(f"the table has no columns of {few(missing)}: it is read without these rows of the fit")
-    return measured_table(given.csv, rows, units)
+    return measured_table(csv, rows, units)
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -53,14 +55,27 @@ BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0
 """Of the ball on the tool by images, m."""
 FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
-Entry = tuple[str, str | list[str] | bool, str]
-"""An option, its value, and why."""
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
 """Median residual of a registration, m, or without positions as a share, above which no reading is right."""
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
+
+
+class Choice(NamedTuple):
+    """One entry of the campaign file: an option, its value, and why; a remark if the option is empty."""
+
+    name: str
+    value: str | list[str] | bool
+    why: str
+
+    def line(self) -> str:
+        """As TOML."""
+        values = self.value if isinstance(self.value, list) else [self.value]
+        written = [json.dumps(value, ensure_ascii=False) for value in values]
+        text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
+        return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
 @dataclass(frozen=True)
@@ -89,28 +104,32 @@ class RowColumns:
         """Whether the rows are corners of a board in images."""
         return any(text.startswith(CORNERS) for text in self.readings)
 
-    def entries(self) -> Iterator[Entry]:
-        """(option, value, why) of each."""
+    def entries(self) -> Iterator[Choice]:
+        """Those that name them."""
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
-            yield "position", names, f"{len(names)} marker(s), by their names"
+            yield Choice("position", names, f"{len(names)} marker(s), by their names")
         if self.sockets:
-            yield "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
+            yield Choice(
+                "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
+            )
         if self.readings:
             why = "by names; `displacement` is a distance with an unknown zero"
             if any(text.endswith(LENS) for text in self.readings):
                 why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
             sizes = self.of_boards and not self.readings[0].endswith(".yaml")
             why += "; width and height of the images are the least usual size that holds all corners" * sizes
-            yield "reading", self.readings[0] if len(self.readings) == 1 else self.readings, why
+            yield Choice("reading", self.readings[0] if len(self.readings) == 1 else self.readings, why)
         if self.session is not None:
             why = "by its name: the device, or its set-up, of every row"
             why += "; add `remounted = true` if it stayed and the markers were mounted anew" * bool(self.markers)
-            yield "session", self.session, why
+            yield Choice("session", self.session, why)
         if self.payload is not None:
-            yield "payload", self.payload, "by its name: the known mass that the robot carried"
+            yield Choice("payload", self.payload, "by its name: the known mass that the robot carried")
         for option, column in self.covariates.items():
-            yield option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
+            yield Choice(
+                option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
+            )
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
@@ -168,11 +187,11 @@ def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str
     return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
 
-def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
-    """(option, value, why) of rotations, standard deviations and distances of sockets."""
+def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
+    """Rotations, standard deviations and distances of sockets."""
     if source.rows.sockets:
         lines = distance_lines(source.csv, sheet, source.rows.sockets[-1], source.table.length)
-        yield from (("", "", line) for line in lines)
+        yield from (Choice("", "", line) for line in lines)
     if source.rows.markers:
         yield from rotation(source)
         yield from deviations(source)
@@ -203,19 +222,6 @@ class Source:
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
 
-    def positions(self, table: TableFormat) -> Measurements | None:
-        """The measured positions of the largest set-up; None if the table cannot be read so."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                data = self.read(table)
-                if table.rotation is not None:
-                    check_poses(data)
-            except DiffeoCalibError:
-                return None
-        found = measured_positions(data)
-        return None if found is None else found.largest_session()
-
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
 
@@ -234,9 +240,10 @@ class Source:
         """The same; DiffeoCalibError says why a table cannot be read so, or calibrates nothing."""
         data = self.read(table)
         positions = measured_positions(data)
+        if positions is None or table.rotation is not None:
+            check_poses(data)
         if positions is not None:
             return likely_mistakes.residual_of(self.robot, positions.largest_session())
-        check_poses(data)
         own, readings = divided(data)
         if own is not None:
             return _in_sockets(self.robot, own.table)
@@ -297,30 +304,36 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
-def _clear_reading(source: Source, formats: Mapping[Any, TableFormat], other: str) -> tuple[Any, str] | None:
-    """The format, by its key, with which the nominal robot explains the positions best, and why.
+def residuals(source: Source, formats: Mapping[Any, TableFormat]) -> list[tuple[float, Any]]:
+    """Median residual of the nominal robot in every format, and its key; the smallest first."""
+    return sorted(((source.residual(table), key) for key, table in formats.items()), key=lambda found: found[0])
 
-    None unless it is clearly better than all others, which ``other`` names.
-    """
-    residuals = {}
-    for key, table in formats.items():
-        data = source.positions(table)
-        if data is not None:
-            residuals[key] = likely_mistakes.residual_of(source.robot, data)
-    found = min(residuals, key=lambda key: residuals[key], default=None)
-    others = [value for key, value in residuals.items() if key != found]
-    best = residuals.get(found, LARGEST_RESIDUAL)
-    if best >= LARGEST_RESIDUAL or any(value < gates.READINGS_TOLD_APART * best for value in others):
+
+def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
+    """Whether the first of some residuals is small, and every other one larger by this ratio."""
+    (best, _), *others = found
+    return best < LARGEST_RESIDUAL and all(value >= ratio * best for value, _ in others)
+
+
+def _clear_rotation(source: Source, formats: Mapping[Any, TableFormat], other: str) -> tuple[Any, str] | None:
+    """The format, by its key, that explains poses clearly better than all others, which ``other`` names; and why."""
+    (best, key), *others = found = residuals(source, formats)
+    if not is_clear(found, gates.READINGS_TOLD_APART):
         return None
-    than = f", {other} at least {1e3 * min(others):.3g} mm" if others else ""
-    return found, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    than = f", {other} at least {1e3 * others[0][0]:.3g} mm" if others and others[0][0] < inf else ""
+    return key, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
 
 
-def rotation(source: Source) -> Iterator[Entry]:
-    """(option, value, why) of a rotation: the convention with which the nominal robot explains the poses best.
+def _readings_of(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Conventions and units in which so many columns can hold a rotation."""
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
+    return product(conventions, ("deg", "rad") if len(names) == 3 else (None,))
 
-    Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
-    option is empty says so.
+
+def rotation(source: Source) -> Iterator[Choice]:
+    """A rotation: the convention with which the nominal robot explains the poses best.
+
+    Nothing if there are no such columns, or no convention is clearly better than all others; then a remark says so.
     """
     guessed = [guess_rotation(source.numbers, marker) for marker in source.rows.markers]
     each = [names for names in guessed if names is not None and not set(names) & set(source.joints)]
@@ -328,65 +341,64 @@ def rotation(source: Source) -> Iterator[Entry]:
     if not each or len(each) < len(guessed) or not alone or len(guessed) != max(len(source.tips), 1):
         return
     names = [name for own in each for name in own]
-    units = ("deg", "rad") if len(each[0]) == 3 else (None,)
     columns = each[0] if len(each) == 1 else each
-    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])]
     formats = {
         (name, unit): replace(source.table, rotation=columns, convention=name, rotation_angle=unit)
-        for name, unit in product(conventions, units)
+        for name, unit in _readings_of(each[0])
     }
-    found = _clear_reading(source, formats, "with any other convention or unit")
+    found = _clear_rotation(source, formats, "with any other convention or unit")
     if found is None:
-        yield "", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used"
+        yield Choice("", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used")
         return
     (convention, unit), reason = found
     written = [",".join(own) for own in each]
     why = "by their names; without these three lines positions alone are calibrated"
-    yield "rotation", written[0] if len(written) == 1 else written, why
-    yield "convention", convention, reason
+    yield Choice("rotation", written[0] if len(written) == 1 else written, why)
+    yield Choice("convention", convention, reason)
     if unit is not None:
-        yield "rotation-angle", unit, "the same"
+        yield Choice("rotation-angle", unit, "the same")
 
 
-def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
-    """(option, value, why) of units and rotations that make the rows poses of a board seen by a camera on the tool.
+def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
+    """Units and rotations that make the rows poses of a board seen by a camera on the tool.
 
     Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
     """
     names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
     if names is None or set(names) & set(source.joints):
         return
-    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
-    turns = ("deg", "rad") if len(names) == 3 else (None,)
-    marks = sheet.sep, sheet.decimal
     formats = {
-        key: TableFormat(*key[:2], *marks, names, *key[2:], camera_on_tool=True)
-        for key in product(("m", "mm"), ("rad", "deg"), conventions, turns)
+        (length, angle, *turn): TableFormat(length, angle, sheet.sep, sheet.decimal, names, *turn, camera_on_tool=True)
+        for length, angle, turn in product(("m", "mm"), ("rad", "deg"), list(_readings_of(names)))
     }
-    found = _clear_reading(source, formats, "read in any other way")
+    found = _clear_rotation(source, formats, "read in any other way")
     if found is None:
         return
     (length, angle, convention, unit), reason = found
-    yield "length", length, reason
-    yield "angle", angle, "the same"
-    yield "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
-    yield "convention", convention, "the same"
+    yield Choice("length", length, reason)
+    yield Choice("angle", angle, "the same")
+    yield Choice(
+        "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
+    )
+    yield Choice("convention", convention, "the same")
     if unit is not None:
-        yield "rotation-angle", unit, "the same"
-    yield "camera-on-tool", True, "the nominal robot explains the inverse poses alone"
+        yield Choice("rotation-angle", unit, "the same")
+    yield Choice("camera-on-tool", True, "the nominal robot explains the inverse poses alone")
 
 
-def deviations(source: Source) -> Iterator[Entry]:
-    """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
+def deviations(source: Source) -> Iterator[Choice]:
+    """Standard deviations of the positions, or a remark why there are none."""
     names = guess_deviations(source.numbers, source.rows.markers)
     if names is None:
         return
-    data = source.positions(replace(source.table, std=names))
-    if data is None or data.std is None or float(data.std.nanmedian()) > LARGEST_DEVIATION:
-        yield "", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used"
+    found = measured_positions(source.read(source.table))
+    with suppress(DiffeoCalibError):
+        found = measured_positions(source.read(replace(source.table, std=names)))
+    if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
+        yield Choice("", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used")
         return
-    typical = 1e3 * float(data.std.nanmedian())
-    yield "std", ",".join(names), f"by their names; median {typical:.2g} mm, noise beyond these is estimated"
+    why = f"by their names; median {1e3 * typical:.2g} mm, noise beyond these is estimated"
+    yield Choice("std", ",".join(names), why)
 
 
 def distance_lines(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -180,14 +180,16 @@ def _version() -> str:
         return "unknown"
 
 
-def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path], *, may_come: str | None = None) -> None:
+def check_outputs(
+    outputs: Mapping[str, Path | None], inputs: dict[str, Path], *, may_come: Container[str] = ()
+) -> None:
     """Refuse files that cannot be written, that are also read, or that are named twice, and unknown kinds of images.
 
     --json is one of the files. Files that are read must exist, which is known at once, before anything is loaded.
 
     Args:
         outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
-        may_come: the argument whose file may not exist yet.
+        may_come: names of files that may not exist yet.
     """
     wanted, record.path = record.path, None  # nothing is written there before the place has been checked
     named = {option: path for option, path in outputs.items() if path is not None}
@@ -201,7 +203,7 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path], *, m
     if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
         raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
     for name, path in inputs.items():
-        if name != may_come and not os.path.lexists(path):
+        if name not in may_come and not os.path.lexists(path):
             kind = "model file" if name in ("MODEL", "OLD") else "file"
             raise InputError.of(f"there is no {kind} {path}", fix=f"check the path of {name}")
 

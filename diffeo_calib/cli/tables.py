@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
 import torch
 import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line
+from diffeo_calib.cli.app import add_to_command_line, leaves_of, names_of
+from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Correction, Format, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -148,13 +149,12 @@ def stated_units(units: StoredUnits) -> Units:
     return Units(**given)
 
 
-def _options_of(group: type[Format] | type[Rows]) -> dict[str, tuple[str, Any]]:
+def _options_of(group: type[StoredUnits] | type[Rows]) -> dict[str, tuple[str, Any]]:
     """Option -> name and type of its field."""
-    hints = get_type_hints(group)
-    return {f"--{field.name.replace('_', '-')}": (field.name, hints[field.name]) for field in fields(group)}
+    return {names_of(field)[0]: (name, hint) for name, (hint, field) in leaves_of(group)}
 
 
-def _read_options(words: Sequence[str], group: type[Format] | type[Rows]) -> dict[str, list[str]]:
+def _read_options(words: Sequence[str], group: type[StoredUnits] | type[Rows]) -> dict[str, list[str]]:
     """Option of a group -> its words in a command line."""
     found: dict[str, list[str]] = {}
     options = _options_of(group)
@@ -177,9 +177,8 @@ def _completed(group: Any, words: Sequence[str]) -> Any:
         wrong = [text for text in texts if text not in allowed]
         if wrong:
             raise ValueError(f"'{wrong[0]}' for {option}")
-        values = [float(text) for text in texts] if float in get_args(kind) else texts
-        several = any(get_origin(one) is list for one in get_args(kind))
-        changes[name] = True if kind is bool else values if several else values[-1]
+        values = [float(text) for text in texts] if has(kind, float) else texts
+        changes[name] = True if kind is bool else values if has(kind, list) else values[-1]
     return replace(group, **changes)
 
 
@@ -253,7 +252,7 @@ class ProgramTable:
     csv: Path
     joints: str | None
     table: TableFormat
-    given: Correction
+    given: Targets
 
     def commands(self, robot: Tree) -> Tensor:
         """(N, n) joint values, rad or m."""

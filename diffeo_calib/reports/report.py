@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -16,11 +15,11 @@ from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find
-from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
+from diffeo_calib.reports.analysis.findings import PositionFindings, check_arguments, find
+from diffeo_calib.reports.analysis.kinds import Findings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import kinds, sections, sentences
-from diffeo_calib.reports.html.document import Page, Section
+from diffeo_calib.reports.html.document import Page
 from diffeo_calib.sensors.places import Places
 
 LOG = logging.getLogger(__name__)
@@ -40,7 +39,7 @@ def write_report(
     against: Sequence[str] = (),
     tolerance: float | None = None,
     progress: Progress = silent,
-) -> Findings | KindFindings:
+) -> Findings:
     """Write a self-contained HTML page about a calibration.
 
     Args:
@@ -70,45 +69,42 @@ def write_report(
     if tolerance is not None:
         check_number(tolerance, "`tolerance`", above=0.0)
     if of_positions_alone(model, data):
-        found = find(model, data, stages=stages, against=against, progress=progress)
-        words, made = sentences, sections.sections(found, progress)
+        found: Findings = find(model, data, stages=stages, against=against, progress=progress)
     else:
         if against:
             got, fix = ", ".join(against), "leave them out: this page shows errors of each kind of rows in its own unit"
             raise InputError.of("`against`", expected="a table of measured positions", got=got, fix=fix)
         found = find_kinds(model, data, stages=stages, places=places, progress=progress)
-        words, made = kinds, kinds.sections(found)
-    shown_page = page(found, words, made, title, None if data is None else data.sha256)
-    shown_page = replace(shown_page, verdict=f"{judged(found, tolerance)}{shown_page.verdict}")
-    if warnings is not None:
-        shown_page = replace(shown_page, warnings=warnings)
-    write_whole(path, shown_page.html().encode())
+    robot, made, summary, words = model.robot, model.provenance, model.summary, words_of(found)
+    date = "" if made is None else f", fitted {made.date[:10]}"
+    note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
+    fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", words.rows_of(found)
+    if warnings is None:
+        warnings = (summary.warnings or "").splitlines() if summary else []
+    sha256 = None if data is None or not found.new else data.sha256
+    page = Page(
+        title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
+        subtitle=f"{fit}. Errors: {rows}.",
+        verdict=f"{judged(found, tolerance)}{words.verdict(found)}",
+        warnings=warnings,
+        advice=list(words.advice(found)),
+        figures=dict(words.figures(found)),
+        sections=[*sections.sections(found, rows, progress), sections.record(model, sha256)],
+    )
+    write_whole(path, page.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
 
 
-def judged(found: Findings | KindFindings, tolerance: float | None) -> str:
+def judged(found: Findings, tolerance: float | None) -> str:
     """Whether a tolerance, m, is kept, as a sentence; nothing without one."""
     if tolerance is None:
         return ""
-    within = "Within" if found.rms <= tolerance else "Above"
-    return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * found.rms:.3f} mm RMS {found.rms_of}. "
+    rms, of = found.judged
+    within = "Within" if rms <= tolerance else "Above"
+    return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * rms:.3f} mm RMS {of}. "
 
 
-def page(
-    found: Findings | KindFindings, words: ModuleType, parts: Iterable[Section], title: str, data_sha256: str | None
-) -> Page:
-    """The page about these findings: what ``words`` say about them, these sections, and the record of the model."""
-    model, robot, made, summary = found.model, found.model.robot, found.model.provenance, found.model.summary
-    date = "" if made is None else f", fitted {made.date[:10]}"
-    note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
-    fit = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}"
-    return Page(
-        title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
-        subtitle=f"{fit}. Errors: {words.rows_of(found)}.",
-        verdict=words.verdict(found),
-        warnings=(summary.warnings or "").splitlines() if summary else [],
-        advice=list(words.advice(found)),
-        figures=dict(words.figures(found)),
-        sections=[*parts, sections.record(model, data_sha256 if found.new else None)],
-    )
+def words_of(found: Findings) -> ModuleType:
+    """The sentences about some findings: their rows, verdict, advice and figures."""
+    return sentences if isinstance(found, PositionFindings) else kinds

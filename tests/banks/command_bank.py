@@ -42,8 +42,7 @@ def leave_undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
     What the model expects is averaged over fewer configurations.
     """
-    for name in ("stages", "kinds"):
-        monkeypatch.setattr(f"diffeo_calib.reports.analysis.{name}.CONFIGURATIONS", FEW_CONFIGURATIONS)
+    monkeypatch.setattr("diffeo_calib.reports.analysis.stages.CONFIGURATIONS", FEW_CONFIGURATIONS)
     path = "diffeo_calib.reports.html.sections.panel"
     monkeypatch.setattr(path, lambda _, label, *__, **___: replace(UNDRAWN, label=label))
 

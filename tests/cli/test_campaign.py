@@ -14,6 +14,7 @@ from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
 
 import diffeo_calib as dc
+from diffeo_calib.cli.app import DECLARED as KNOWN
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.cli.guesses import (
@@ -35,8 +36,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-KNOWN = ["robot", "base", "position", "length", "holdout", "json", "joints", "sep"]
-
 
 def campaign(tmp_path: Path, text: str) -> str:
     (tmp_path / "cell.toml").write_text(text, encoding="utf-8")
@@ -55,7 +54,7 @@ def test_entries_become_options(tmp_path: Path) -> None:
 def test_typed_options_replace_those_of_the_file(tmp_path: Path, typed: list[str]) -> None:
     """A tip beside those of the file would be another arm."""
     text = 'csv = "a.csv"\ntip = ["one", "two"]\nholdout = 0.2\n'
-    words = expanded(["fit", campaign(tmp_path, text), *typed], [*KNOWN, "tip"])
+    words = expanded(["fit", campaign(tmp_path, text), *typed], KNOWN)
     assert words[2:] == ["--holdout", "0.2", *typed]
 
 
@@ -99,7 +98,7 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     assert "median residual of the nominal robot" in done.out
     words = expanded(
         ["fit", str(out / "cell.toml")],
-        ["robot", "base", "tip", "joints", "position", "sep", "decimal", "length", "angle", "output", "report"],
+        KNOWN,
     )
     options = dict(zip(words[2::2], words[3::2], strict=True))
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
@@ -154,7 +153,7 @@ def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
     assert "fill in the lines that say `uncomment`, then run" in done.err + done.out
     filled = tomllib.loads(text.replace("# distance", "distance"))
     assert filled["distance"] == ["a,b=50"]
-    words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], [*written, *filled])
+    words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], KNOWN)
     assert words[words.index("--socket") + 1] == "place,socket"
     assert words[words.index("--distance") + 1] == "a,b=50"
 

@@ -14,10 +14,9 @@ from command_bank import Command, Site, edited, environment, rows_of
 
 import diffeo_calib as dc
 from diffeo_calib.cli import campaign as fleet
+from diffeo_calib.cli.app import DECLARED as KNOWN
 from diffeo_calib.cli.campaign import Fleet, asked
 from diffeo_calib.common.errors import InputError
-
-KNOWN = ["robot", "base", "tip", "position", "length", "angle", "output", "holdout", "json", "controls", "figure"]
 
 
 def campaign(folder: Path, name: str, text: str = 'csv = "a.csv"\n') -> str:

@@ -5,175 +5,45 @@ from __future__ import annotations
 import pytest
 from command_bank import Command
 
-TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
-POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--camera-on-tool", "--std", "--rotation-std"]
-DRIFT = ["--time", "--temperature"]
-SOCKETS = ["--socket", "--distance", "--distance-std"]
-JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
-OPTIONS = {
-    "fit": [
-        *(
-            "CSV",
-            "--robot",
-            "--base",
-            "--tip",
-            *SOCKETS,
-            "--reading",
-            "--load",
-            "--session",
-            "--remounted",
-            "--payload",
-            *DRIFT,
-        ),
-        *(*TABLE, *POSES),
-        *(
-            "-o",
-            "--output",
-            "--holdout",
-            "--seed",
-            "--controls",
-            "--duplicates",
-            "--figure",
-            "--note",
-            "--scales-of",
-            "--report",
-            "--jobs",
-        ),
-    ],
-    "campaign": [
-        *(
-            "CSV",
-            "--robot",
-            "--base",
-            "--tip",
-            "--load",
-            *TABLE,
-            *POSES,
-            *SOCKETS,
-            "--reading",
-            "--session",
-            "--remounted",
-            *DRIFT,
-        ),
-        *(
-            "--payload",
-            "--target",
-            "--stdin",
-            "--json-lines",
-            "--bag",
-            "--seen",
-            "--joint-states",
-            "--speed",
-            "--once",
-            "--candidates",
-            "--page",
-            "--next",
-            "--accepted",
-        ),
-    ],
-    "record": ["BAG", "--seen", "-o", "--output", "--joints", "--still", "--shortest", "--offset"],
-    "evaluate": [
-        *(
-            "MODEL",
-            "CSV",
-            *SOCKETS,
-            "--reading",
-            "--session",
-            "--remounted",
-            *TABLE,
-            *POSES,
-            "--payload",
-            *DRIFT,
-            "--register",
-            "--free",
-        ),
-        *JUDGED,
-    ],
-    "init": ["CSV", "URDF", "-o", "--output", "--force"],
-    "images": [
-        *(
-            "FOLDER",
-            "JOINTS",
-            "--board",
-            "--length",
-            "-o",
-            "--output",
-            "--board-std",
-            "--overview",
-            "--sep",
-            "--decimal",
-        ),
-    ],
-    "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
-    "correct": [
-        *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
-        *("--tip", "--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload-mass"),
-    ],
-    "export": [
-        *("MODEL", "--urdf", "--mjcf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
-        *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--camera", "--tool", "--tool-from", "--frame", "--payload-mass", "--tip"),
-    ],
-    "plan": [
-        *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),
-        *(
-            "--candidates",
-            "--target-poses",
-            "--measured",
-            "--draw",
-            "--range",
-            "--tracker",
-            "--facing",
-            "--cone",
-            "--floor",
-        ),
-        *("--column", "--collisions", "--sensor", "--payload-mass", *TABLE[1:]),
-    ],
-    "recalibrate": [
-        *(
-            "OLD",
-            "CSV",
-            *TABLE,
-            *POSES,
-            *SOCKETS,
-            "--reading",
-            "--session",
-            "--remounted",
-            "--payload",
-            *DRIFT,
-            "-o",
-            "--output",
-            "--marker-freedom",
-            "--drift",
-            "--seed",
-            "--note",
-        ),
-    ],
-    "compare": [
-        *("OLD", "OTHER", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--remounted", "--payload", *DRIFT),
-        *("--marker-freedom", "--level", "--seed", "--figure"),
-    ],
-    "report": [
-        *(
-            "MODEL",
-            "-o",
-            "--output",
-            "--data",
-            *TABLE,
-            *POSES,
-            *SOCKETS,
-            "--reading",
-            "--session",
-            "--remounted",
-            "--payload",
-            *DRIFT,
-        ),
-        *("--title", "--against", "--tolerance"),
-    ],
-    "demo": ["-o", "--output", "--rows", "--seed"],
+UNITS = "--length --angle --joint-length --joints --sep --decimal"
+ROWS = (
+    "--position --rotation --convention --rotation-angle --lever --camera-on-tool --std --rotation-std --socket "
+    "--distance --distance-std --reading --session --remounted --payload --time --temperature"
+)
+TEXTS = {
+    "fit": (
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load -o --output --holdout --seed --controls --duplicates "
+        "--figure --note --scales-of --report --jobs"
+    ),
+    "campaign": (
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --target --stdin --json-lines --bag --seen "
+        "--joint-states --speed --once --candidates --page --next --accepted"
+    ),
+    "record": "BAG --seen -o --output --joints --still --shortest --offset",
+    "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
+    "init": "CSV URDF -o --output --force",
+    "images": "FOLDER JOINTS --board --length -o --output --board-std --overview --sep --decimal",
+    "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
+    "correct": (
+        f"{UNITS} MODEL PROGRAM --position --rotation --convention --rotation-angle -o --output --tip --tool "
+        "--tool-from --frame --limit --rate --payload-mass"
+    ),
+    "export": (
+        "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --ur-hash --joint-offsets "
+        "--correction-tables --with-tables --robot --length --angle --c --torch --onnx --camera --tool "
+        "--tool-from --frame --payload-mass --tip"
+    ),
+    "plan": (
+        f"{UNITS} MODEL --robot --base --tip --marker -n --count -o --output --free --seed --candidates "
+        "--target-poses --measured --draw --range --tracker --facing --cone --floor --column --collisions "
+        "--sensor --payload-mass"
+    ),
+    "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",
+    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --level --seed --figure",
+    "report": f"{ROWS} {UNITS} MODEL -o --output --data --title --against --tolerance",
+    "demo": "-o --output --rows --seed",
 }
-for _options in OPTIONS.values():
-    _options.append("--json")
+OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
 
 
 def entries(text: str) -> dict[str, str]:

@@ -74,7 +74,7 @@ def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path, monkeypatch: 
     text = path.read_text()
     assert "How good" in text
     if kind.name in FREE:
-        assert "What to expect" in text
+        assert "Expected error of positions by stage" in text
         assert "compare measured positions" in text
     if kind.name == "images":
         assert "RMS [px]" in text

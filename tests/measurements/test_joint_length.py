@@ -14,7 +14,7 @@ from table_bank import HEADER, Reader, read_table
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Correction, Units
+from diffeo_calib.cli.options import Targets, Units
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -55,7 +55,7 @@ def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)
     write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)
-    source = ProgramTable(path, None, table, Correction())
+    source = ProgramTable(path, None, table, Targets())
     assert_close(source.commands(robot), q, rtol=1e-14, atol=1e-15)
     header, first, *_ = list(csv.reader(path.read_text().splitlines()))
     cells = dict(zip(header, first, strict=True))

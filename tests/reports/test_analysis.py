@@ -17,7 +17,7 @@ from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.analysis.repeats import repeats_of
-from diffeo_calib.reports.analysis.stages import expected_errors, stages_of
+from diffeo_calib.reports.analysis.stages import Deviations, stages_of
 from diffeo_calib.reports.html.sentences import advice
 
 
@@ -169,7 +169,7 @@ def test_stages_from_a_model_are_those_of_its_calibration(
 @pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "posed"))])
 def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.FixtureRequest) -> None:
     case: Case = request.getfixturevalue(name)
-    found = expected_errors(case.model)
+    found = Deviations.of(case.model).planned(case.model)
     if name == "posed":
         variance = case.model.predict_poses(found.q, noise=False)[1][:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
     else:
@@ -177,7 +177,8 @@ def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.F
     torch.testing.assert_close(found.deviation.square(), variance, rtol=1e-4, atol=0)
     low, high = case.train.q.amin(0), case.train.q.amax(0)
     assert bool(((found.q >= low) & (found.q <= high)).all())
-    assert found.measured_rms < found.error.workspace
+    assert found.error.measured < found.error.workspace
+    assert found.next is not None
     assert len(found.next) == 5
 
 

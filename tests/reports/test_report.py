@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, Measureme
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.findings import PositionFindings as Findings
 from diffeo_calib.reports.analysis.kinds import find_kinds
 from diffeo_calib.reports.report import judged
 from diffeo_calib.robots.geometry import Geometry
@@ -33,6 +33,7 @@ POSITION = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
 
 def made(path: Path, model: dc.CalibratedKinematics, data: dc.Measurements | None = None, **options: str) -> Findings:
     found = dc.write_report(model, path, data, **options)  # pyright: ignore[reportArgumentType]
+    assert isinstance(found, Findings)
     check_page(path.read_text(encoding="utf-8"))
     return found
 
@@ -297,7 +298,7 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     tracked = own.table
     wrong = with_attributes(tracked, points=tracked.points + 0.003 * torch.sin(97.0 * tracked.points))
     found = find_kinds(kind.model, wrong)
-    assert found.deviations.error.whole < 1e-3 < found.rms
+    assert found.deviations.error.whole < 1e-3 < found.judged[0]
     assert judged(found, 1e-3).startswith("Above")
     assert judged(find_kinds(kind.model, None), 1e-3).startswith("Within")
 

@@ -17,11 +17,11 @@ from diffeo_calib.campaign.feeds import ID, Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
+from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.models import load_robot
-from diffeo_calib.cli.options import LiveOptions, Robot
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import MeasuredTable, joint_columns
+from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.bags import read_bag
@@ -34,18 +34,19 @@ JOURNAL = ".journal"
 LOOK_SECONDS = 0.1
 
 
-def run(links: Robot, source: MeasuredTable, given: LiveOptions) -> None:
+def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
+    source = measured_table(given.csv, given.rows, given.units)
     limit = parsed_limit(given.target, "--target")
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--target {given.target}", expected="a length, such as 0.15mm")
-    robot, played = load_robot(links), _stops(source, given)
+    robot, played = load_robot(given.robot), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
-        live = Live(campaign, source, links.tip, journal, given)
+        live = Live(campaign, source, given.robot.tip, journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
@@ -63,7 +64,7 @@ def run(links: Robot, source: MeasuredTable, given: LiveOptions) -> None:
         raise typer.Exit(code)
 
 
-def _stops(source: MeasuredTable, given: LiveOptions) -> list[dict[str, float]]:
+def _stops(source: MeasuredTable, given: CampaignOptions) -> list[dict[str, float]]:
     """The stops of a bag; InputError for a table in other units."""
     if given.bag is None or given.seen is None:
         return []
@@ -89,7 +90,7 @@ def play(
     inbox.put(None)
 
 
-def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -> int:
+def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:
     """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
@@ -105,7 +106,7 @@ def _followed(live: Live, given: LiveOptions, inbox: Inbox, page: Page | None) -
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
-def _happening(live: Live, given: LiveOptions, inbox: Inbox) -> Iterator[bool]:
+def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
         Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()

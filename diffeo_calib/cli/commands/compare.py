@@ -4,22 +4,15 @@ from __future__ import annotations
 
 from math import degrees
 from pathlib import Path
-from typing import Any
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
-from diffeo_calib.cli.commands.recalibrate import (
-    change_lines,
-    changes_entry,
-    doubt,
-    offsets_entry,
-    smallest_entry,
-    smallest_lines,
-)
+from diffeo_calib.cli.commands.recalibrate import change_entries, change_lines, doubt, smallest_lines
 from diffeo_calib.cli.console import plain, say
+from diffeo_calib.cli.declarations import CompareOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
-from diffeo_calib.cli.options import TableOptions
 from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.plots.joints import comparison
 
@@ -33,18 +26,23 @@ def is_model(path: Path) -> bool:
         return path.suffix.lower() not in (".csv", ".txt")
 
 
-def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) -> None:
-    """Compare a model with new measurements."""
-    model = load_kinematics(old)
-    source = table_of(model, table)
+def run(given: CompareOptions) -> None:
+    """Compare a model with new measurements, or with another model."""
+    if is_model(given.other):
+        if given.rows.named or given.units.length or given.units.angle:
+            fix = "leave out the options of tables, or name a table"
+            raise InputError.of(f"{given.other} is a model, beside options of a table", fix=fix)
+        return _models(given.old, given.other, given.tests.seed, given.figure)
+    if given.figure is not None:
+        raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
+    model = load_kinematics(given.old)
+    source = table_of(model, given.other, given.rows, given.units)
     say(*provenance_lines(model), *another_date_lines(model))
-    found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)
+    found = compare(model, source.read(model.robot), level=given.level, **vars(given.tests))
     if not isinstance(found, Comparison):
-        return
+        return None
     record.add(
-        changes=changes_entry(found.changes),
-        smallest_offsets=smallest_entry(found.changes),
-        possible_offsets=offsets_entry(found.hidden),
+        **change_entries(found.changes, found.hidden),
         rows_can_tell=found.telling and found.changes.tested,
         **({} if found.moved is None else {"transform": found.moved.transform}),
         **entries_by_kind(
@@ -58,7 +56,7 @@ def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) ->
     say(*(change_lines(found.changes) if found.changes.found else [str(found), *smallest_lines(found.changes)]))
 
 
-def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
+def _models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
     """Compare two models, and draw where they differ."""
     models = [load_kinematics(path) for path in (old, other)]
     for model in models:
@@ -74,7 +72,7 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         expected_m=found.expected,
         largest_m=found.largest,
         geodesic_length=found.geodesic_length,
-        changes=changes_entry(found.changes),
+        changes=change_entries(found.changes)["changes"],
         transmissions_rad_or_m=found.transmissions,
         files={} if figure is None else {"figure": figure},
     )

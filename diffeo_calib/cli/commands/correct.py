@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import degrees, isnan, radians
-from pathlib import Path
 
 import torch
 from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say
+from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.options import Correction, StoredUnits
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns, table_format
 from diffeo_calib.common.checks import check_number
@@ -75,12 +74,13 @@ class ToolOnTip:
         return "tool" if self.place is None else f"tool on {self.tip}"
 
 
-def run(model: Path, program: Path, units: StoredUnits, options: Correction, output: Path) -> None:
+def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
-    kinematics = load_laden(model, options.payload_mass)
-    stated = as_fitted(kinematics, None, units)[1]
-    source = ProgramTable(program, stated.joints, table_format(stated), options)
+    kinematics = load_laden(options.model, options.payload_mass)
+    stated = as_fitted(kinematics, None, options.units)[1]
+    program, output = options.program, options.output
+    source = ProgramTable(program, stated.joints, table_format(stated), options.targets)
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
@@ -116,18 +116,18 @@ def run(model: Path, program: Path, units: StoredUnits, options: Correction, out
     )
 
 
-def _check(options: Correction) -> None:
+def _check(options: CorrectOptions) -> None:
     """Refuse options without effect."""
     if options.limit is not None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:
         check_number(options.rate, "--rate", above=0.0)
-    if options.frame == "measuring" and not options.position:
+    if options.frame == "measuring" and not options.targets.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
-def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -> list[ToolOnTip]:
+def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableFormat) -> list[ToolOnTip]:
     """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):

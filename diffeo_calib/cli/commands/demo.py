@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 
+from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.declarations import DemoOptions
+from diffeo_calib.cli.record import make_folder
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -14,8 +16,10 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 
-def simulate(folder: Path, rows: int, seed: int) -> list[str]:
-    """Write the arm and its measurements, print the command that calibrates it, and return the command's arguments."""
+def run(given: DemoOptions) -> None:
+    """Write an arm and its measurements, and calibrate it by a command that is printed."""
+    make_folder(given.output)
+    folder, rows, seed = given.output, given.rows, given.seed
     arm = SimulatedArm(seed=seed)
     urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
     arm.write_urdf(urdf)
@@ -30,4 +34,4 @@ def simulate(folder: Path, rows: int, seed: int) -> list[str]:
     command = [[str(argument) for argument in line] for line in lines]
     say(f"{rows} simulated measurements written to {csv}. Now running:\n")
     say("  diffeo-calib " + " \\\n      ".join(shlex.join(line) for line in command) + "\n")
-    return [argument for line in command for argument in line]
+    app([argument for line in command for argument in line])

@@ -12,6 +12,7 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.declarations import EvaluateOptions
 from diffeo_calib.cli.models import (
     another_date_lines,
     check_payload_column,
@@ -19,7 +20,6 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.options import EvaluateOptions, TableOptions
 from diffeo_calib.cli.printed import ErrorTable, expectation_lines, outlier_lines, registration_lines, socket_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
@@ -47,10 +47,10 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 """Of the table of residuals."""
 
 
-def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
+def run(options: EvaluateOptions) -> None:
     """Run the command."""
-    model = load_kinematics(path)
-    source = table_of(model, table)
+    model, path = load_kinematics(options.model), options.model
+    source = table_of(model, options.csv, options.rows, options.units)
     limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
     say(*provenance_lines(model))

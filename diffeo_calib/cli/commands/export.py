@@ -11,8 +11,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.options import Export
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
@@ -51,7 +51,7 @@ class _Export:
         geometry: the rigid kinematics that are written; None for none.
     """
 
-    def __init__(self, model: CalibratedKinematics, given: Export) -> None:
+    def __init__(self, model: CalibratedKinematics, given: ExportOptions) -> None:
         self.model, self.given = model, given
         self.length, self.angle = given.length, given.angle
         self.files: dict[str, bytes] = {}
@@ -127,10 +127,10 @@ class _Export:
         self.lines += _table_lines(tables)
 
 
-def run(path: Path, given: Export) -> None:
+def run(given: ExportOptions) -> None:
     """Write the files, then say what each leaves of the model."""
     wanted = {option: target for option, target in given.outputs.items() if target is not None}
-    model = load_laden(path, given.payload_mass)
+    model = load_laden(given.model, given.payload_mass)
     units = TableFormat(given.length, given.angle)
     own = tool_in_tip(model, given.tool, given.tool_from, units)
     tool = None if given.tool is None else own
@@ -157,7 +157,7 @@ def run(path: Path, given: Export) -> None:
 
 
 def _write_programs(
-    model: CalibratedKinematics, given: Export, tool: Tensor | None, source: CFiles | None
+    model: CalibratedKinematics, given: ExportOptions, tool: Tensor | None, source: CFiles | None
 ) -> Iterator[str]:
     """Write the programs that are no texts; yields a sentence about each program.
 
@@ -214,7 +214,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
-def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
+def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)

@@ -16,8 +16,8 @@ from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
+from diffeo_calib.cli.declarations import FitOptions
 from diffeo_calib.cli.models import load_kinematics, load_robot, made_by_command
-from diffeo_calib.cli.options import FitOptions, Robot
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -28,7 +28,7 @@ from diffeo_calib.cli.printed import (
     stage_line,
 )
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
@@ -47,11 +47,12 @@ Errors = dict[str, KindErrors]
 """Errors of every stage by the kind of rows."""
 
 
-def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) -> None:
+def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
+    source = measured_table(given.csv, given.rows, given.units, given.duplicates)
     with exit_on_interrupt(), progress_bar() as progress:
-        chain, others = load_robot(robot), [load_kinematics(path) for path in given.scales_of or ()]
-        data = source.read(chain, robot.tip)
+        chain, others = load_robot(given.robot), [load_kinematics(path) for path in given.scales_of or ()]
+        data = source.read(chain, given.robot.tip)
         train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
@@ -59,10 +60,10 @@ def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) ->
     own = result.placed.coordinates
     on_tool = None if own is None else own.table.sees_board_from_tool  # of a camera that measured the rows
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
-    save(result.model, output)  # before anything is printed: output may be cut off
+    save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**hand_eye_entry(hand_eye))
-    _record(result, in_train, held_out, {"model": output, "figure": given.figure, "report": given.report})
+    _record(result, in_train, held_out, {"model": given.output, "figure": given.figure, "report": given.report})
     say(*_verdict(result, held_out or {}))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
@@ -72,7 +73,7 @@ def run(robot: Robot, source: MeasuredTable, output: Path, given: FitOptions) ->
     for one in (held_out or {}).values():
         if one.one.what == ERRORS:
             _show_verdict(one.stages[GEOMETRIC], one.stages[CALIBRATED], wrong=bool(wrong))
-    say(f"model: {output}")
+    say(f"model: {given.output}")
     shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, given, source.csv.name, held_out or in_train, **shown)
     _end(result, in_train, held_out or in_train)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
 from pathlib import Path
 
 from diffeo_calib.cameras.board import BoardPrior
@@ -12,7 +11,7 @@ from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.options import BoardImages
+from diffeo_calib.cli.declarations import ImagesOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
@@ -20,11 +19,11 @@ from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 
 
-def run(folders: Sequence[Path], joints: Path, given: BoardImages, output: Path) -> None:
+def run(given: ImagesOptions) -> None:
     """Find the board, and write corners, cameras and overview."""
-    table = TableFormat(given.length, "rad", given.sep, given.decimal)
+    output, table = given.output, TableFormat(given.length, "rad", given.sep, given.decimal)
     with progress_bar() as progress:
-        found = read_folders(folders, joints, Board.of(given.board), table.sep, progress)
+        found = read_folders(given.folders, given.joints, Board.of(given.board), table.sep, progress)
     text, several = io.StringIO(newline=""), len(found) > 1
     sheet = csv.writer(text, delimiter=table.sep)
     sheet.writerow([IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several])

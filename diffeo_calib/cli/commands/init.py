@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from math import inf
 from os.path import relpath
@@ -12,40 +11,27 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
 from diffeo_calib.cli.options import CORNERS
+from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
-CLEAR_RESIDUAL_RATIO = 0.2
-"""A reading is clear if its residual is below this share of every other one's."""
+CLEAR_RATIO = 5.0
+"""A reading is clear if every other one's residual is larger by this."""
 COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
 """Entries that name columns."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One entry of the campaign file: its value, and why."""
-
-    name: str
-    value: str | list[str] | bool
-    why: str
-
-    def line(self) -> str:
-        """As TOML."""
-        values = self.value if isinstance(self.value, list) else [self.value]
-        written = [json.dumps(value, ensure_ascii=False) for value in values]
-        text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
-        return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
-
-
-def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
-    """Propose a campaign, write it, and print it; a file that was edited is replaced with ``force`` alone."""
+def run(given: InitOptions) -> None:
+    """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
+    csv, output = given.csv, given.output
     sheet = guess_sheet(csv)
-    choices = list(_choices(csv, urdf, output, sheet))
+    choices = list(_choices(csv, given.urdf, output, sheet))
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -53,7 +39,7 @@ def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
         f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
     ]
     content = ("\n".join(lines) + "\n").encode()
-    if output.exists() and not force and output.read_bytes() != content:
+    if output.exists() and not given.force and output.read_bytes() != content:
         fix = "name another file by -o, or add --force to replace it"
         raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
     write_whole(output, content)
@@ -76,18 +62,16 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     leaf = "a leaf below it; the markers are fixed to it or to a link before it"
     yield Choice("tip", tips, "leaves after which the columns are named") if tips else Choice("tip", tip, leaf)
     yield Choice("joints", ",".join(joints), how)
-    yield from (Choice(*entry) for entry in rows.entries())
+    yield from rows.entries()
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    seen = proposals.Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+    seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
     table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    beside: Iterable[proposals.Entry] = (
-        () if "rotation" in found else proposals.beside(replace(seen, table=table), sheet)
-    )
-    yield from (Choice(*entry) for entry in beside)
+    if "rotation" not in found:
+        yield from proposals.beside(replace(seen, table=table), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
@@ -103,40 +87,34 @@ def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], s
     raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
 
 
-def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
+def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
     """Units with which the nominal robot can explain the positions, or the sockets."""
     no_length = source.rows.without_length and all(source.robot.periodic)
-    lengths = ("mm",) if no_length else ("m", "mm")
-    residuals: dict[tuple[str, ...], float] = {}
-    cameras = ("", "camera on the tool") if source.rows.of_boards else ("",)
-    for length, angle, camera in product(lengths, ("rad", "deg"), cameras):
-        table = TableFormat(length, angle, sheet.sep, sheet.decimal, camera_on_tool=bool(camera))
-        residuals[length, angle, camera] = source.residual(table)
-    (length, angle, camera), best = min(residuals.items(), key=lambda entry: entry[1])
-    others = min(value for units, value in residuals.items() if units != (length, angle, camera))
-    found = source.words(best, others)
-    if not best < proposals.LARGEST_RESIDUAL or best > CLEAR_RESIDUAL_RATIO * others:
-        seen = [Choice(*entry) for entry in proposals.camera(source, sheet)]
-        if seen:
-            yield from seen
-            return
-        if best == inf:
-            source.read_residual(TableFormat(length, angle, sheet.sep, sheet.decimal))  # says why
-        got = "; ".join(
-            f"{' and '.join(filter(None, units))}: {source.size(value)}" for units, value in residuals.items()
+    marks = sheet.sep, sheet.decimal
+    formats = {
+        key: TableFormat(*key[:2], *marks, camera_on_tool=bool(key[2]))
+        for key in product(
+            ("mm",) if no_length else ("m", "mm"),
+            ("rad", "deg"),
+            ("", "camera on the tool") if source.rows.of_boards else ("",),
         )
-        fix = (
-            "check the table's joints against the URDF, or write the file yourself; of a robot with several tips the "
-            "columns of each are to be named after it, such as left_x"
-        )
-        raise InputError.of(
-            "units with which the robot explains the rows", expected="one clear reading", got=got, fix=fix
-        )
-    if no_length:
-        yield Choice("length", length, "of lengths that you add: the table holds none")
-    else:
-        yield Choice("length", length, found)
-    yield Choice("angle", angle, found if no_length else "the same")
+    }
+    (best, (length, angle, camera)), *others = found = proposals.residuals(source, formats)
+    if not proposals.is_clear(found, CLEAR_RATIO):
+        poses = list(proposals.camera(source, sheet))
+        if best == inf and not poses:
+            source.read_residual(TableFormat(length, angle, *marks))  # says why
+        if not poses:
+            got = "; ".join(f"{' and '.join(filter(None, units))}: {source.size(value)}" for value, units in found)
+            fix = "check the table's joints against the URDF, or write the file yourself; of a robot with several tips "
+            fix += "the columns of each are to be named after it, such as left_x"
+            what = "units with which the robot explains the rows"
+            raise InputError.of(what, expected="one clear reading", got=got, fix=fix)
+        yield from poses
+        return
+    why = source.words(best, others[0][0])
+    yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
+    yield Choice("angle", angle, why if no_length else "the same")
     if camera:
         yield Choice("camera-on-tool", True, "the same; else the board is on the tool")
 

@@ -16,8 +16,9 @@ from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor, Where
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
-from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned, StoredUnits
+from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
@@ -57,11 +58,12 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
     return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
-def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits, *, count: int, output: Path) -> None:
+def run(given: PlanOptions) -> None:
     """Plan, write the poses, and print what to expect of them."""
+    cell, count, output = given.cell, given.count, given.output
     with exit_on_interrupt(), progress_bar() as progress:
-        model = None if path is None else load_kinematics(path)
-        stated = stated_units(units) if model is None else as_fitted(model, None, units)[1]
+        model = None if given.model is None else load_kinematics(given.model)
+        stated = stated_units(given.units) if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
         source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
@@ -102,7 +104,7 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
         say(*(line for one in sensors for line in one.sentences()))
 
 
-def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:
+def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
     """A chain in a URDF, and the markers (P, 3) on its tip, m."""
     tips = given.tip or []
     robot = load_urdf(given.robot or "", given.base or "", tips[0] if len(tips) == 1 else tips)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import Progress, progress_bar, say
+from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows, TableOptions
+from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, table_format, with_rows
 from diffeo_calib.common.errors import InputError
@@ -52,12 +52,12 @@ def counted(blocks: Iterable[Laden], rows: int, progress: Progress) -> Iterator[
         progress("rows", done, rows)
 
 
-def run(model: Path, given: TableOptions, output: Path) -> None:
+def run(given: PredictOptions) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     A payload that is a number is the mass of all rows.
     """
-    kinematics = load_kinematics(model)
+    kinematics, output = load_kinematics(given.model), given.output
     say(*provenance_lines(kinematics))
     table, joints = _written_as_read(kinematics, given)
     robot, with_poses = kinematics.robot, kinematics.lever is not None
@@ -88,9 +88,10 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(model: CalibratedKinematics, given: TableOptions) -> tuple[TableFormat, str | None]:
+def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> tuple[TableFormat, str | None]:
     """The format of the predictions, and the names of the joint columns, by default those of the fit."""
-    rows, units = given.rows, given.units
+    units = given.units
+    rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
     read, stated = as_fitted(model, rows, units)
     if units.length is None or units.angle is None:
         rotation_angle = rows.rotation_angle or read.rotation_angle

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -14,8 +13,8 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.declarations import RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
-from diffeo_calib.cli.options import TableOptions
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import few
@@ -23,10 +22,11 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-def run(old: Path, table: TableOptions, output: Path, **how: Any) -> None:
+def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
-    model = load_kinematics(old)
-    source = table_of(model, table)
+    model, output = load_kinematics(given.old), given.output
+    source = table_of(model, given.csv, given.rows, given.units)
+    how: Any = {**vars(given.tests), "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)
@@ -34,10 +34,8 @@ def run(old: Path, table: TableOptions, output: Path, **how: Any) -> None:
         result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     record.add(
-        changes=changes_entry(result.changes),
+        **change_entries(result.changes, result.hidden),
         rows_can_tell=result.changes.tested,
-        smallest_offsets=smallest_entry(result.changes),
-        possible_offsets=offsets_entry(result.hidden),
         markers=result.marker,
         **({} if result.moved is None else {"transform": result.moved.transform}),
         converged=result.fit.converged,
@@ -92,17 +90,20 @@ def doubt(changes: Changes, where: str) -> str:
     return "" if changes.tested else f": a change of the robot, which was not tested, would be {where}"
 
 
-def changes_entry(changes: Changes) -> list[dict[str, object]]:
-    """Changes for programs."""
-    return [
-        {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
-        for one in changes.found
-    ]
-
-
-def offsets_entry(hidden: Sequence[HiddenOffset]) -> list[dict[str, object]]:
-    """Offsets that explain new places of device or markers as well, for programs."""
-    return [{"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden]
+def change_entries(changes: Changes, hidden: Sequence[HiddenOffset] = ()) -> dict[str, list[dict[str, object]]]:
+    """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
+    return {
+        "changes": [
+            {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
+            for one in changes.found
+        ],
+        "smallest_offsets": [
+            {"joint": one.joint, "size_rad_or_m": one.size if isfinite(one.size) else None} for one in changes.smallest
+        ],
+        "possible_offsets": [
+            {"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden
+        ],
+    }
 
 
 def change_lines(changes: Changes) -> list[str]:
@@ -116,8 +117,3 @@ def smallest_lines(changes: Changes) -> list[str]:
         return []
     listed = ", ".join(map(str, changes.smallest))
     return [f"smallest change of an offset that these rows would show in nine cases of ten: {listed}"]
-
-
-def smallest_entry(changes: Changes) -> list[dict[str, object]]:
-    """The same for programs; None where places hide it."""
-    return [{"joint": one.joint, "size_rad_or_m": one.size if isfinite(one.size) else None} for one in changes.smallest]

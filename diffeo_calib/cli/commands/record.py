@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.declarations import RecordOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole
@@ -14,21 +13,22 @@ from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 
 
-def run(bag: Path, topics: tuple[str, str], output: Path, limits: StopLimits, offset: float | None) -> None:
+def run(given: RecordOptions) -> None:
     """Find the stops, write them, and say how to go on."""
-    joints, names, seen = read_bag(bag, *topics)
+    output, offset, limits = given.output, given.offset, StopLimits(joints=given.still, shortest=given.shortest)
+    joints, names, seen = read_bag(given.bag, given.joints, given.seen)
     if seen.values.shape[1]:
         found, offset = stops(joints, seen, limits, offset)
         table = rows_of(names, found)
         write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)], ",", "\n"))
-        say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {topics[1]}")
+        say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
         rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
         say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
     else:
         offset = offset or 0.0
         found, without = pictured(joints, seen.times, limits, offset)
         times, files = [time for _, time in found], dict[float, str]()
-        for time, suffix, content in read_images(bag, topics[1], times):
+        for time, suffix, content in read_images(given.bag, given.seen, times):
             files[time] = f"{times.index(time):05d}{suffix}"
             write_whole(output.parent / files[time], content)
         rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]

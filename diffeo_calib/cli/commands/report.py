@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 from diffeo_calib.cli.commands.acceptance import parsed_limit
 from diffeo_calib.cli.console import exit_on_interrupt, plain, progress_bar, say
+from diffeo_calib.cli.declarations import ReportOptions
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
-from diffeo_calib.cli.options import Page, TableOptions
-from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
+from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.analysis.findings import Findings, unseen
-from diffeo_calib.reports.html import kinds, sentences
-from diffeo_calib.reports.report import judged, write_report
+from diffeo_calib.reports.analysis.findings import PositionFindings, unseen
+from diffeo_calib.reports.report import judged, words_of, write_report
 
 
-def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> None:
+def run(wanted: ReportOptions) -> None:
     """Write the page, and say its first line."""
-    kinematics = load_kinematics(model)
-    data = None if table is None else table_of(kinematics, table).read(kinematics.robot)
+    kinematics, data = load_kinematics(wanted.model), None
+    if wanted.data is not None:
+        data = table_of(kinematics, wanted.data, wanted.rows, wanted.units).read(kinematics.robot)
     limit = parsed_limit(wanted.tolerance, "--tolerance")
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--tolerance {wanted.tolerance}", expected="a length, such as 0.15mm")
@@ -29,26 +26,24 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
-        found = write_report(kinematics, output, data, **given, progress=progress)
+        found = write_report(kinematics, wanted.output, data, **given, progress=progress)
     say(*provenance_lines(kinematics))
-    words: Any = sentences if isinstance(found, Findings) else kinds
-    if isinstance(found, Findings):
-        left_out, coverage = found.predictions.left_out, found.predictions.coverage()
-        record.add(errors={name: errors_entry(errors) for name, errors in found.errors.items()}, coverage_95=coverage)
-    else:
-        left_out = not found.new
-        record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=dict(found.expected))
-    error = found.expected.error if isinstance(found, Findings) else found.deviations.error
+    words, error = words_of(found), found.deviations.error
+    verdict = f"{judged(found, tolerance)}{words.verdict(found)}"
     record.add(
+        **entries_by_kind(found.kinds),
+        expected_error_by_stage_m=dict(found.expected),
         expected_error=error.entry(),
-        left_out=left_out,
-        verdict=f"{judged(found, tolerance)}{words.verdict(found)}",
+        left_out=not found.new,
+        verdict=verdict,
         advice=list(words.advice(found)),
-        files={"report": output},
+        files={"report": wanted.output},
     )
-    if data is not None and left_out:
-        each = "each predicted by all others" if isinstance(found, Findings) else "as fitted"
+    each = "as fitted"
+    if isinstance(found, PositionFindings):
+        record.add(coverage_95=found.predictions.coverage())
+        each = "each predicted by all others"
+    if data is not None and not found.new:
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(f"{judged(found, tolerance)}{words.verdict(found)}")
-    say(f"expected absolute error over the joint ranges of the fit: {plain(error.sentence)}")
-    say(f"report: {output}")
+    say(verdict, f"expected absolute error over the joint ranges of the fit: {plain(error.sentence)}")
+    say(f"report: {wanted.output}")

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
-from diffeo_calib.calibration.findings import Outlier, Part, parts
+from diffeo_calib.calibration.expected_errors import expected_errors
+from diffeo_calib.calibration.findings import Outlier, parts
 from diffeo_calib.calibration.judgement import block_text, larger_than_expected, steps_of
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.result import Progress, silent
@@ -23,6 +24,7 @@ from diffeo_calib.kinematics.evaluation import (
     implausible,
     impossible,
     place,
+    placement_sentences,
     residuals,
     rows_used_in_fit,
 )
@@ -32,9 +34,10 @@ from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
+from diffeo_calib.reports.analysis.kinds import Findings
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
-from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, expected_errors, stages_of
+from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
 from diffeo_calib.sensors.errors import Evaluation
 from diffeo_calib.sensors.known_drift import KnownDrift
 
@@ -50,30 +53,22 @@ COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Findings:
-    """Numbers of a report.
+class PositionFindings(Findings):
+    """Numbers of a report about measured positions, or poses, alone.
 
     Args:
-        model: the model. rows: those of its fit.
-        stages: kinematics to compare: nominal, geometric, calibrated.
+        rows: those of the fit.
         predictions: rows that the model has not seen, or those of its fit, each predicted by all others.
-        errors: errors of each stage on these rows.
         repeats: what repeated configurations show; None if there are none.
         learning_curve: number of rows -> error of others, m; empty if the rows are not known.
-        parts: what explains how much. expected: where the model is uncertain.
         outliers: rows that look wrong among those of ``predictions``, and ``moved``: what else happened to them.
         columns: further columns of the table that errors are shown against, by name.
     """
 
-    model: CalibratedKinematics
     rows: FitRows
-    stages: Mapping[str, Kinematics]
     predictions: Predictions
-    errors: Mapping[str, Evaluation]
     repeats: Repeats | None
     learning_curve: Sequence[tuple[int, float]]
-    parts: Sequence[Part]
-    expected: ExpectedErrors
     outliers: Sequence[Outlier]
     moved: Sequence[str]
     columns: Mapping[str, Tensor]
@@ -88,20 +83,23 @@ class Findings:
         """Share of the expected variance that knowing the markers would remove."""
         geometry = self.model.nominal.geometry
         tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-        return self.rows.map.explained_by(tool, self.expected.q[:PROBE_CONFIGURATIONS])
-
-    rms_of = "of these rows"
+        return self.rows.map.explained_by(tool, self.deviations.q[:PROBE_CONFIGURATIONS])
 
     @property
-    def new(self) -> bool:
-        """Whether the model has not seen the rows shown."""
-        return not self.predictions.left_out
+    def repeatability(self) -> float | None:
+        """As of the class above."""
+        return None if self.repeats is None else self.repeats.deviation
 
     @property
-    def rms(self) -> float:
-        """RMS error of the model on the rows shown, m."""
+    def errors(self) -> Mapping[str, Evaluation]:
+        """Errors of each stage on the rows shown."""
+        return next(iter(self.kinds.values()))
+
+    @property
+    def judged(self) -> tuple[float, str]:
+        """The RMS error of the model on the rows shown, m, which is compared with a tolerance."""
         *_, own = self.errors.values()
-        return own.rms
+        return own.rms, "of these rows"
 
     @property
     def limit(self) -> float:
@@ -118,7 +116,7 @@ def find(
     stages: Mapping[str, Kinematics] | None = None,
     against: Sequence[str] = (),
     progress: Progress = silent,
-) -> Findings:
+) -> PositionFindings:
     """Compute everything that a report shows.
 
     Args:
@@ -154,16 +152,20 @@ def find(
     progress("analysis", 2, STEPS)
     repeats, curve = _repeats(rows, model, data, kinematics), rows.learning_curve() if rows.known else []
     progress("analysis", 3, STEPS)
-    found = Findings(
+    deviations = Deviations.of(model).planned(model)
+    found = PositionFindings(
         model=model,
-        rows=rows,
         stages=kinematics,
+        kinds={predictions.errors.kind: errors},
+        new=not predictions.left_out,
+        devices=placement_sentences(model),
+        expected=expected_errors(model, kinematics, deviations.error),
+        deviations=deviations,
+        parts=parts(model),
+        rows=rows,
         predictions=predictions,
-        errors=errors,
         repeats=repeats,
         learning_curve=curve,
-        parts=parts(model),
-        expected=expected_errors(model),
         outliers=outliers,
         moved=_moved(model, predictions, outliers),
         columns=_columns(predictions.data, against),

@@ -8,21 +8,13 @@ from typing import Any
 
 import torch
 
-from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
+from diffeo_calib.calibration.expected_errors import expected_errors
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import check_rows, place, placement_sentences, residuals, rows_used_in_fit
-from diffeo_calib.reports.analysis.stages import (
-    CONFIGURATIONS,
-    MEASURED,
-    Deviations,
-    Kinematics,
-    claimed,
-    configurations,
-    placed_stages,
-)
+from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, placed_stages
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 
@@ -31,11 +23,12 @@ STEPS = 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KindFindings:
-    """Numbers of a report about rows that are not positions alone.
+class Findings:
+    """Numbers of a report about rows of any kinds.
 
     Args:
-        model: the model. kinds: kind -> stage -> errors of the rows shown; empty without rows.
+        model: the model. stages: kinematics to compare: nominal, geometric, calibrated.
+        kinds: kind -> stage -> errors of the rows shown; empty without rows.
         new: whether the model has not seen these rows. devices: where devices are and what was found from the rows.
         expected: stage -> RMS error of positions that the model expects over the joint ranges of its rows, m.
         deviations: what it expects at random configurations there, and at those of the fit.
@@ -43,12 +36,18 @@ class KindFindings:
     """
 
     model: CalibratedKinematics
+    stages: Mapping[str, Kinematics]
     kinds: Mapping[str, Mapping[str, Evaluation]]
     new: bool
     devices: Sequence[str]
     expected: Mapping[str, float]
     deviations: Deviations
     parts: Sequence[Part]
+
+    @property
+    def repeatability(self) -> float | None:
+        """RMS distance of measurements of the same configuration from their mean, m, if poses were repeated."""
+        return None
 
     @property
     def judged(self) -> tuple[float, str]:
@@ -63,16 +62,6 @@ class KindFindings:
             expected = self.deviations.error.whole
             found.append((expected, "expected of positions over the joint ranges of the fit"))
         return max(found)
-
-    @property
-    def rms(self) -> float:
-        """See :attr:`judged`."""
-        return self.judged[0]
-
-    @property
-    def rms_of(self) -> str:
-        """Its source, in words."""
-        return self.judged[1]
 
     @property
     def count(self) -> int:
@@ -93,7 +82,7 @@ def find_kinds(
     stages: Mapping[str, Kinematics] | None = None,
     places: Mapping[str, Places] | None = None,
     progress: Progress = silent,
-) -> KindFindings:
+) -> Findings:
     """Compute what a report shows of rows of any kinds.
 
     Args:
@@ -116,13 +105,10 @@ def find_kinds(
                 kinds.setdefault(kind, {})[name] = own
     devices += placement_sentences(model)
     progress("analysis", 1, STEPS)
-    fitted, q = model.configurations.to(HOST), configurations(model, CONFIGURATIONS, 0)
-    some = fitted[:: -(-len(fitted) // MEASURED)]
-    error = ExpectedError.of(model)
-    deviations = Deviations(q, claimed(model, q), some, claimed(model, some), error)
-    expected = expected_errors(model, stages, error)
+    deviations = Deviations.of(model)
+    expected = expected_errors(model, stages, deviations.error)
     progress("analysis", STEPS, STEPS)
-    return KindFindings(model, kinds, new, devices, expected, deviations, parts(model))
+    return Findings(model, stages, kinds, new, devices, expected, deviations, parts(model))
 
 
 def _errors(

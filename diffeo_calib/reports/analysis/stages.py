@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -65,6 +65,7 @@ class Deviations:
         deviation: (M,) RMS distance of the markers that the model claims there, m.
         measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
         error: what the model expects in all, as every command says it.
+        next: poses that would lower the deviations most, in the order of the moves; None unless they were planned.
     """
 
     q: Tensor
@@ -73,28 +74,19 @@ class Deviations:
     measured_deviation: Tensor
     error: ExpectedError
 
-    @property
-    def measured_rms(self) -> float:
-        """RMS error expected at configurations of the fit, m."""
-        return self.error.measured
+    next: Plan | None = None
 
+    @classmethod
+    def of(cls, model: CalibratedKinematics, seed: int = 0) -> Deviations:
+        """The deviations of a model at random configurations."""
+        q, fitted = configurations(model, CONFIGURATIONS, seed), model.configurations.to(HOST)
+        fitted = fitted[:: -(-len(fitted) // MEASURED)]
+        return cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
 
-@dataclass(frozen=True, eq=False)
-class ExpectedErrors(Deviations):
-    """The same with poses that would lower the deviations most, in the order of the moves."""
-
-    next: Plan
-
-
-def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedErrors:
-    """The deviations of a model at random configurations, and the poses to measure next."""
-    q = configurations(model, CONFIGURATIONS, seed)
-    fitted = model.configurations.to(HOST)
-    fitted = fitted[:: -(-len(fitted) // MEASURED)]
-    options = torch.cat([q, *_seen_configurations(model, CONFIGURATIONS, seed)])
-    found = plan(model, options, NEXT, target=q[:TARGETS])
-    deviation = found.known_rms[: len(q)] if model.registration is None else claimed(model, q)
-    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), ExpectedError.of(model), found)
+    def planned(self, model: CalibratedKinematics, seed: int = 0) -> Deviations:
+        """The same with poses that would lower the deviations most."""
+        options = torch.cat([self.q, *_seen_configurations(model, CONFIGURATIONS, seed)])
+        return replace(self, next=plan(model, options, NEXT, target=self.q[:TARGETS]))
 
 
 def _seen_configurations(model: CalibratedKinematics, count: int, seed: int) -> Iterator[Tensor]:

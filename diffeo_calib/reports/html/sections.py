@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from math import isfinite
+from typing import Any
 
 import torch
 
-from diffeo_calib.calibration.findings import Outlier, Part
+from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
-from diffeo_calib.kinematics.evaluation import at_payloads, placement_sentences
+from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
-from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.findings import PositionFindings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.kinds import Findings
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
-from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import (
     Picture,
@@ -45,11 +47,14 @@ from diffeo_calib.reports.plots.joints import (
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.payload import payload_sentence
-from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import Evaluation
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
+FLATTERING = {
+    "spread": "A spread within sockets is no error: what all rows of a socket share does not show in it.",
+    "readings": "Errors of readings do not show what no reading sees, such as the robot's size with heights.",
+}
 PER_LETTER = 0.066
 """Width of a letter of a panel, inches."""
 OPEN_SHARE = 0.8
@@ -60,9 +65,7 @@ SCENE_DECIMALS = 5
 """Decimals of a length in m that a scene needs: 10 um at 1 m."""
 
 
-def stage_pictures(
-    stages: Mapping[str, Evaluation], suffix: str = "", repeatability: float | None = None
-) -> Iterator[Picture]:
+def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability: float | None) -> Iterator[Picture]:
     """Errors of one kind of rows by stage; ``suffix`` tells the pictures of several kinds apart."""
     some = next(iter(stages.values()))
     label = f"Share of rows whose {some.label} is at most a value."
@@ -89,79 +92,83 @@ def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     return Table(f"{some.title} by stage", header, rows)
 
 
-def expected_pictures(robot: Tree, expected: Deviations, label: str) -> list[Picture]:
-    """The error that the model itself expects against every joint."""
-    return [
-        panel(f"expected-{k}", label.format(printable(name)), draw_expected, robot, k, expected, key=k == 0)
-        for k, name in enumerate(robot.joint_names)
-    ]
-
-
-def parts_picture(parts: Sequence[Part]) -> Picture:
-    """Displacement explained by each part of a model."""
-    left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in parts)
-    frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
-    return panel("parts", "What each part of the model explains (parts may cancel).", draw_parts, parts, frame=frame)
-
-
-def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
-    """Contents of the page before its record."""
-    for number, section in enumerate(every := (how_good, where, why, trust, repeatability)):
-        progress("drawing", number, len(every))
+def sections(found: Findings, rows: str, progress: Progress = silent) -> Iterator[Section]:
+    """Contents of the page before its record; ``rows`` are those shown, in words."""
+    yield how_good(found, rows)
+    measured = measured_where, measured_why, trust, repeatability
+    every: Any = measured if isinstance(found, PositionFindings) else (where, other_why)
+    for number, section in enumerate(every, 1):
+        progress("drawing", number, 1 + len(every))
         yield section(found)
-    yield from devices(placement_sentences(found.model))
+    if found.devices:
+        see = "Where devices and sockets stand, and what was found from the rows shown as the model did not know it."
+        yield Section("devices", "Devices", see, text=[printable(line) for line in found.devices])
 
 
-def devices(lines: Sequence[str]) -> Iterator[Section]:
-    """Where devices are, if there is anything to say."""
-    if lines:
-        see = "Where devices and sockets stand, and what was found from the rows shown because the model did not know "
-        see += "it."
-        yield Section("devices", "Devices", see, text=[printable(line) for line in lines])
-
-
-def how_good(found: Findings) -> Section:
-    """Errors by stage."""
-    pictures = list(stage_pictures(found.errors, "", None if found.repeats is None else found.repeats.deviation))
-    see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
+def how_good(found: Findings, rows: str) -> Section:
+    """Errors of every kind of rows by stage."""
+    pictures = [
+        picture
+        for number, stages in enumerate(found.kinds.values())
+        for picture in stage_pictures(stages, f"-{number}", found.repeatability)
+    ]
+    see = f"Errors on {rows}: each stage should lie well to the left of the one before it."
+    see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
+    see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
         "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
     ]
-    if found.predictions.left_out:
+    present = {next(iter(stages.values())).what for stages in found.kinds.values()}
+    notes += [text for what, text in FLATTERING.items() if what in present]
+    if found.kinds and not found.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses (--data) are the stronger proof."
         )
-    return Section("errors", "How good", see, [stage_table(found.errors)], None, pictures, notes)
+    return Section("errors", "How good", see, [stage_table(own) for own in found.kinds.values()], None, pictures, notes)
 
 
 def where(found: Findings) -> Section:
-    """The workspace in space, and expected errors against every joint."""
-    robot, expected = found.model.robot, found.expected
+    """What the model expects of its positions: by stage, and against every joint."""
+    robot, error = found.model.robot, found.deviations.error
     label = "Error that the model itself expects against {}: dashed anywhere in the measured ranges, solid where "
-    pictures = expected_pictures(robot, expected, f"{label}it was measured.")
-    q = expected.next.q[expected.next.rank.argsort()]
-    table = Table(
-        f"Where to measure next: {len(q)} poses that would lower the expected error most",
-        ["rank", *(str(rank) for rank in range(1, len(q) + 1))],
-        joint_values_by_row(robot, q),
-    )
+    words, what = f"{label}it was measured.", (draw_expected, robot)
+    pictures = [
+        panel(f"expected-{k}", words.format(printable(name)), *what, k, found.deviations, key=k == 0)
+        for k, name in enumerate(robot.joint_names)
+    ]
     see = (
-        "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
-        f"model itself expects, without the noise of a measurement: {rough_millimetres(expected.measured_rms)} mm RMS "
-        f"at the measured configurations; anywhere in the measured joint ranges {printable(expected.error.sentence)}."
+        "The error that the model itself expects, without the noise of a measurement: "
+        f"{rough_millimetres(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
+        f"ranges {printable(error.sentence)}"
     )
-    notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
-    then = rough_millimetres(float(expected.next.expected_rms[-1]))
-    notes.append(
-        f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the "
-        "ranges. Check them in the robot's cell before you move there."
-    )
-    return Section("where", "Where", see, [table], _scene(found), pictures, notes)
+    if found.model.own_frame:
+        see += ", after a rigid fit, because no device says where the robot stands"
+    rows = [[name, millimetres(value)] for name, value in found.expected.items()]
+    table = Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)
+    return Section("where", "Where", f"{see}.", [table], None, pictures)
 
 
-def _scene(found: Findings) -> Scene:
+def measured_where(found: PositionFindings) -> Section:
+    """The same with the workspace in space, and the poses to measure next."""
+    own, robot, plan = where(found), found.model.robot, found.deviations.next
+    tables, notes = list(own.tables), [*sentences.unlike_poses(found), *sentences.worst_range(found)]
+    if plan is not None:
+        q = plan.q[plan.rank.argsort()]
+        caption = f"Where to measure next: {len(q)} poses that would lower the expected error most"
+        ranks = ["rank", *(str(rank) for rank in range(1, len(q) + 1))]
+        tables.append(Table(caption, ranks, joint_values_by_row(robot, q)))
+        then = rough_millimetres(float(plan.expected_rms[-1]))
+        notes.append(
+            f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the "
+            "ranges. Check them in the robot's cell before you move there."
+        )
+    see = f"Arrows point from the predicted to the measured place, with one scale in all views. Below: {own.see}"
+    return replace(own, see=see, tables=tables, scene=_scene(found), notes=notes)
+
+
+def _scene(found: PositionFindings) -> Scene:
     seen = found.predictions
     there = ~seen.measured.isnan().any(2)  # of the sightings
     step, errors = -(-int(there.sum()) // MOST_POINTS), {}
@@ -174,23 +181,44 @@ def _scene(found: Findings) -> Scene:
 
 
 def why(found: Findings) -> Section:
-    """Transmission errors, parts, geometry corrections."""
-    robot = found.model.robot
-    pictures = [parts_picture(found.parts)]
-    for joint, name in enumerate(robot.joint_names):
+    """What each part of the model explains, and sag and waves of its gears in words."""
+    left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in found.parts)
+    frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=left)
+    label = "What each part of the model explains (parts may cancel)."
+    picture = panel("parts", label, draw_parts, found.parts, frame=frame)
+    notes = [
+        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
+        "several joints, task space on the place of the marker."
+    ]
+    notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
+    return Section("why", "Why", "What each part of the model explains.", pictures=[picture], notes=notes)
+
+
+def other_why(found: Findings) -> Section:
+    """The same for rows that are not of positions alone."""
+    own = why(found)
+    note = (
+        "Coverage, learning curve, repeatability and the workspace in space are not shown: they compare measured "
+        "positions with claimed ones, and rows in sockets and readings measure none. The bands of transmission errors "
+        "are those of models of positions."
+    )
+    return replace(own, notes=[*own.notes, note])
+
+
+def measured_why(found: PositionFindings) -> Section:
+    """The same with transmission errors and corrections of the geometry."""
+    own, pictures = why(found), list[Picture]()
+    for joint, name in enumerate(found.model.robot.joint_names):
         label = f"{name}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
         pictures.append(panel(f"transmission-{joint}", label, draw_transmission, found.model, found.rows, joint))
     see = (
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
         "meshing; a wide band means that the joint was measured too little there."
     )
-    notes = [
-        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
-        "several joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
-        "corrections about or along parallel axes stand for one another."
-    ]
-    notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
-    return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
+    note = "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
+    notes = [*own.notes, note]
+    tables = [_corrections(found.model, found.rows)]
+    return replace(own, see=see, tables=tables, pictures=[*own.pictures, *pictures], notes=notes)
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
@@ -224,7 +252,7 @@ MOST_REPEATS = 12
 """Repeated poses that are listed."""
 
 
-def trust(found: Findings) -> Section:
+def trust(found: PositionFindings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
     see = sentences.judged(found)
     tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
@@ -246,7 +274,7 @@ def trust(found: Findings) -> Section:
     return Section("trust", "Can I trust it", see, tables, None, [*_certainty(found), *_residuals(found)], notes)
 
 
-def _certainty(found: Findings) -> Iterator[Picture]:
+def _certainty(found: PositionFindings) -> Iterator[Picture]:
     """Errors that the model expects, and those with fewer rows."""
     label = "Found against claimed shares of errors; on the diagonal the claims are true."
     yield panel("coverage", label, draw_coverage, found.predictions)
@@ -256,7 +284,7 @@ def _certainty(found: Findings) -> Iterator[Picture]:
         yield panel("learning", label, draw_learning_curve, found.learning_curve, found.forecast, limit)
 
 
-def _residuals(found: Findings) -> Iterator[Picture]:
+def _residuals(found: PositionFindings) -> Iterator[Picture]:
     """Errors against the row, time and temperature, and every joint."""
     seen, robot = found.predictions, found.model.robot
     columns = {"row": seen.data.line_numbers.double(), **found.columns}
@@ -272,7 +300,7 @@ def _residuals(found: Findings) -> Iterator[Picture]:
         yield panel(f"residuals-joint-{joint}", label, draw_residuals, *what, key=False)
 
 
-def _largest(found: Findings) -> Table:
+def _largest(found: PositionFindings) -> Table:
     """The rows with the largest errors, beside what the model expects there."""
     seen, robot = found.predictions, found.model.robot
     errors, body = seen.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
@@ -299,7 +327,7 @@ def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
     return Table(caption, ["row", "marker", "off by [mm]", "why"], rows, numeric=False)
 
 
-def repeatability(found: Findings) -> Section:
+def repeatability(found: PositionFindings) -> Section:
     """Figures of ISO 9283, where poses were repeated."""
     repeats = found.repeats
     if repeats is None:

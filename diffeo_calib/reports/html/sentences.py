@@ -9,7 +9,7 @@ import torch
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
-from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.findings import PositionFindings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
 
@@ -31,7 +31,7 @@ MISCALIBRATION_PROBABILITY = 0.05
 """Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""
 
 
-def rows_of(found: Findings) -> str:
+def rows_of(found: PositionFindings) -> str:
     """Source of the errors of a report, in words."""
     count = len(found.predictions)
     if found.predictions.left_out:
@@ -39,7 +39,7 @@ def rows_of(found: Findings) -> str:
     return f"{count} poses that the model has not seen"
 
 
-def verdict(found: Findings) -> str:
+def verdict(found: PositionFindings) -> str:
     """The result in one line."""
     *before, (_, own) = found.errors.items()
     stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
@@ -51,7 +51,7 @@ def verdict(found: Findings) -> str:
     return f"{found_on}. {most} {what} about {1e3 * found.limit:.3f} mm."
 
 
-def figures(found: Findings) -> Iterator[tuple[str, str]]:
+def figures(found: PositionFindings) -> Iterator[tuple[str, str]]:
     """Name and value of the numbers at the top."""
     for name, errors in found.errors.items():
         yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
@@ -62,7 +62,7 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     inside, count = found.predictions.inside()
     yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
-    error = found.expected.error
+    error = found.deviations.error
     if error.whole > FAR_RATIO * error.measured:
         apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
         yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
@@ -70,7 +70,7 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"
 
 
-def advice(found: Findings) -> Iterator[str]:
+def advice(found: PositionFindings) -> Iterator[str]:
     """Next steps, the most important first."""
     yield from found.moved
     if found.outliers:
@@ -104,19 +104,20 @@ def advice(found: Findings) -> Iterator[str]:
         yield f"More poses like these will hardly help: twice as many ({rows}) would bring {change}."
 
 
-def _unless_planned(found: Findings) -> str:
+def _unless_planned(found: PositionFindings) -> str:
     """That planned poses help where more of the same do not, if they do."""
-    now, then = (float(found.expected.next.expected_rms[count]) for count in (0, -1))
-    if now < WORTHWHILE_ERROR_FACTOR * then:
+    plan = found.deviations.next
+    now, then = (0.0, 0.0) if plan is None else (float(plan.expected_rms[count]) for count in (0, -1))
+    if plan is None or now < WORTHWHILE_ERROR_FACTOR * then:
         return ""
     lower = f"from {rough_millimetres(now)} to {rough_millimetres(then)} mm"
     return f"; those listed under Where lower the error expected anywhere in the joint ranges {lower}"
 
 
-def unlike_poses(found: Findings) -> Iterator[str]:
+def unlike_poses(found: PositionFindings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
-    expected, model = found.expected, found.model
-    if expected.error.whole < FAR_RATIO * expected.measured_rms:
+    expected, model = found.deviations, found.model
+    if expected.error.whole < FAR_RATIO * expected.error.measured:
         return
     tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
@@ -136,7 +137,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
         yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."
 
 
-def still_joints(found: Findings) -> Iterator[str]:
+def still_joints(found: PositionFindings) -> Iterator[str]:
     """A sentence about joints that never moved in the fit: their errors are not known."""
     q, robot = found.rows.q, found.model.robot
     for joint, name in enumerate(robot.joint_names):
@@ -149,7 +150,7 @@ def still_joints(found: Findings) -> Iterator[str]:
             )
 
 
-def worst_range(found: Findings) -> Iterator[str]:
+def worst_range(found: PositionFindings) -> Iterator[str]:
     """A sentence about the part of a joint's range with the largest errors, if they are unusual."""
     seen, robot = found.predictions, found.model.robot
     lengths, worst = 1e3 * largest_known(seen.errors.errors), (BAD_RATIO * 1e3 * seen.errors.rms, "")
@@ -168,7 +169,7 @@ def worst_range(found: Findings) -> Iterator[str]:
         yield worst[1]
 
 
-def judged(found: Findings) -> str:
+def judged(found: PositionFindings) -> str:
     """Whether the claimed regions can be believed, as far as the number of rows tells."""
     inside, count = found.predictions.inside()
     low, high = binomial_band(count, 0.95, MISCALIBRATION_PROBABILITY)

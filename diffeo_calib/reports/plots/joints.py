@@ -16,7 +16,7 @@ from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.stages import Deviations, expected_errors
+from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree
 
@@ -97,7 +97,7 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
 
 def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 0) -> Figure:
     """Error that the model itself expects, against every joint over the ranges of its fit."""
-    found = expected_errors(model, seed)
+    found = Deviations.of(model, seed)
     figure, grid = panels(model.robot.n, columns=3, title=title)
     for joint, axes in enumerate(grid):
         draw_expected(axes, model.robot, joint, found)
