@@ -108,7 +108,7 @@ class _Search:
             return
         targets, poses, pull, box = self.targets.take(rows), self.poses[rows], self.pull[rows], self.box.take(rows)
         jacobian, q = self.tool.jacobian(self.q[rows]), self.q[rows]
-        slopes = targets.slopes(jacobian, poses)
+        slopes = targets.slopes(jacobian)
         slope = pull * (q - box.start) - (slopes.swapaxes(1, 2) @ targets.errors(poses)[:, :, None])[:, :, 0]
         hessian = slopes.swapaxes(1, 2) @ slopes + pull[:, :, None] * np.eye(pull.shape[1])
         if self.tool.serial:
@@ -141,7 +141,7 @@ def _finished(tool: ToolFunctions, targets: Targets, q: Array, box: Box, poses: 
     if len(rows):
         inside, goal = box.take(rows), targets.take(rows)
         free = (q[rows] > inside.low) & (q[rows] < inside.high)
-        slopes = goal.slopes(tool.jacobian(q[rows]), poses[rows])
+        slopes = goal.slopes(tool.jacobian(q[rows]))
         room = Box(inside.start, inside.low, inside.high, inside.mobility * free)
         moved, seen, there = chord_search(tool, goal, q[rows], room, slopes=slopes, poses=poses[rows])
         rows, moved, seen = rows[there], moved[there], seen[there]

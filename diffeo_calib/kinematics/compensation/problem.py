@@ -50,28 +50,27 @@ class CompensationProblem:
         return replace(self, targets=self.targets.take(rows), room=self.room.started(rows, start))
 
     def solve(self) -> Solution:
-        """The nearest command of every row on its own."""
+        """The nearest command of every row on its own; none where a start is farther beyond a limit than the bound."""
         count, n = self.room.start.shape
-        found = Solution(np.full((count, n), np.nan), self._no_poses(count), np.empty(count, dtype=int))
-        for first in range(0, count, ROWS_AT_ONCE):
-            rows = np.arange(first, min(first + ROWS_AT_ONCE, count))
+        poses = np.full((count, self.targets.tools, 4, 4), np.nan)
+        found = Solution(np.full((count, n), np.nan), poses, np.full(count, CODE[Status.limit]))
+        box = self.room.box(np.arange(count))
+        possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
+        for first in range(0, len(possible), ROWS_AT_ONCE):
+            rows = possible[first : first + ROWS_AT_ONCE]
             for whole, part in zip(found, self.take(rows)._solve(), strict=True):
                 whole[rows] = part
         return found
 
     def _solve(self) -> Solution:
-        rows = np.arange(len(self.targets))
-        box = self.room.box(rows)
-        nowhere = np.any(box.low > box.high, axis=1)
-        if nowhere.any():
-            return self._without(nowhere)
+        box = self.room.box(np.arange(len(self.targets)))
         q, poses, done = self.search(box, np.clip(box.start, box.low, box.high))
         return self.keep_mimics(Solution(q, poses, self._codes(q, poses, done)))
 
     def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:
         """The fast search from ``q`` (N, n), and the careful one for the rows that it gives up."""
         poses = self.tool.poses(q)
-        slopes = self.targets.slopes(self.rough.jacobian(q), poses)
+        slopes = self.targets.slopes(self.rough.jacobian(q))
         found, seen, done = chord_search(self.tool, self.targets, q, box, slopes=slopes, poses=poses)
         rest = np.flatnonzero(~done)
         if len(rest):
@@ -91,19 +90,6 @@ class CompensationProblem:
         poses[changed] = np.nan
         poses[possible] = self.tool.poses(q[possible])
         return Solution(q, poses, codes)
-
-    def _without(self, nowhere: Array) -> Solution:
-        """Rows that start farther beyond a limit than the bound have no command."""
-        count, n = self.room.start.shape
-        q, poses = np.full((count, n), np.nan), self._no_poses(count)
-        codes = np.full(count, CODE[Status.limit])
-        rows = np.flatnonzero(~nowhere)
-        if len(rows):
-            q[rows], poses[rows], codes[rows] = self.take(rows)._solve()
-        return Solution(q, poses, codes)
-
-    def _no_poses(self, count: int) -> Array:
-        return np.full((count, self.targets.tools, 4, 4), np.nan)
 
     def _codes(self, q: Array, poses: Array, done: Array) -> Array:
         """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
@@ -147,8 +133,8 @@ class CompensationProblem:
         Returns:
             (R,) boolean each.
         """
-        slopes = self._slopes(targets, q, poses)
-        error = targets.independent(targets.errors(poses) * targets.to_metres(self.tool.length))
+        slopes = self._slopes(targets, q)
+        error = targets.errors(poses) * targets.to_metres(self.tool.length)
         U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
         parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
         weak = s <= WEAK_DIRECTION_SHARE * s[:, :1]
@@ -166,13 +152,12 @@ class CompensationProblem:
     def _bend(self, targets: Targets, q: Array, way: Array) -> Array:
         """(R, k) second derivative of the tool along a way (R, n) of the joints."""
         ends = [q + side * DIFFERENCE * way for side in (1.0, -1.0)]
-        speeds = [self._slopes(targets, at, self.rough.poses(at)) @ (way / self.room.bound)[:, :, None] for at in ends]
+        speeds = [self._slopes(targets, at) @ (way / self.room.bound)[:, :, None] for at in ends]
         return (speeds[0] - speeds[1])[:, :, 0] / (2.0 * DIFFERENCE)
 
-    def _slopes(self, targets: Targets, q: Array, poses: Array) -> Array:
+    def _slopes(self, targets: Targets, q: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
-        slopes = targets.slopes(self.rough.jacobian(q), poses)
-        return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound
+        return targets.slopes(self.rough.jacobian(q)) * targets.to_metres(self.tool.length)[:, None] * self.room.bound
 
 
 WEAK_DIRECTION_SHARE = 0.1
