@@ -8,6 +8,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from typing import Any, cast
 
@@ -18,14 +19,15 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.torch_modules import ChainProgram, FlowProgram, constant
+from diffeo_calib.interop.torch_modules import TORCH, TORCH_FLOW, Constants
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
-from diffeo_calib.runtime.program import Program
+from diffeo_calib.runtime.chain import tip_poses
+from diffeo_calib.runtime.flow import advanced
 
 OUTPUTS = ("points", "tool_poses", "poses")
 PRECISIONS = {torch.float64: 1e-9, torch.float32: 1e-4}
@@ -85,7 +87,9 @@ class TorchProgram(nn.Module):
         if program is None and dtype != torch.float64:
             what = "a program of a model with its own functions or kernels, which are recorded as they are,"
             raise InputError.of(what, expected="torch.float64", got=dtype)
-        self.points = deformation if program is None else _ConstantPoints(program, marks)
+        if program is not None and marks is not None:
+            program = replace(program, markers=marks.numpy(), on=(program.tip,) * len(marks))
+        self.points = deformation if program is None else _ConstantPoints(program)
         self.to(dtype)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -99,25 +103,13 @@ class TorchProgram(nn.Module):
         return poses if self.to_frame is None else self.to_frame @ poses
 
 
-class _ConstantPoints(nn.Module):
+class _ConstantPoints(Constants):
     """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
 
-    marks: Tensor
-    on: Tensor
-
-    def __init__(self, program: Program, marks: Tensor | None) -> None:
-        super().__init__()
-        self.joint_flow = FlowProgram(program.joint_flow)
-        self.chain = ChainProgram(program.chain)
-        self.task_flow = FlowProgram(program.task_flow)
-        self.register_buffer("marks", constant(program.markers) if marks is None else marks)
-        on = list(program.on) if marks is None else [program.tip] * len(marks)
-        self.register_buffer("on", torch.tensor(on, dtype=torch.int64, device=HOST))
-
     def forward(self, q: Tensor) -> Tensor:
-        tips = self.chain(self.joint_flow(q)).index_select(1, self.on)  # (N, P, 4, 4)
-        placed = (tips[..., :3, :3] @ self.marks[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return self.task_flow(placed.reshape(-1, 3)).reshape(-1, self.marks.numel())
+        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH_FLOW), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
+        placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
+        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH_FLOW).reshape(-1, self.markers.numel())
 
 
 def export_torch(

@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 def as_index(columns: Sequence[int]) -> slice | list[int]:
     """Columns as an index; consecutive ones as a slice, which makes no copy."""
     columns = list(columns)
-    consecutive = bool(columns) and columns == list(range(columns[0], columns[0] + len(columns)))
-    return slice(columns[0], columns[-1] + 1) if consecutive else columns
+    first = columns[0] if columns else 0
+    consecutive = columns == list(range(first, first + len(columns)))
+    return slice(first, first + len(columns)) if consecutive else columns
 
 
 def cross(a: Any, b: Any) -> Any:

@@ -16,9 +16,10 @@ multiplies it by a higher power of r: a floor under r keeps the product finite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -118,45 +119,18 @@ class PeriodicSum:
         """Where a derivative of low order jumps, in [0, 2 pi)."""
         return np.mod(self.angles, TURN) if self.profile.startswith("matern") else np.zeros(0)
 
-    def values(self, x: Array) -> Array:
-        """f (K,) in rad at x (K,)."""
-        parts = [np.zeros(0)]
-        for rows in self._blocks(len(x)):
-            along = self._around(x[rows]) @ self._circle  # cos(x - q)
-            parts.append(PROFILES[self.profile](self._scale * (1.0 - along))[0] @ self.weights)
-        return np.concatenate(parts)
-
     def derivatives(self, x: Array) -> Array:
         """f, f', f'' in rad, 1, 1/rad: (K, 3) at x (K,)."""
-        parts = [np.zeros((0, 3))]
-        for rows in self._blocks(len(x)):
-            around = self._around(x[rows])
-            along, across = around @ self._circle, around @ self._quarter  # cos, sin of x - q
-            kappa, slope, curvature = PROFILES[self.profile](self._scale * (1.0 - along), slopes=True)
-            first, second = self._scale * across, self._scale * along  # derivatives of the squared distance
+        cosine, sine, scale = np.cos(self.angles), np.sin(self.angles), 2.0 / self.lengthscale**2
+        out, size = np.empty((len(x), 3)), max(BLOCK // len(self.angles), 1)
+        for rows in (slice(first, first + size) for first in range(0, len(x), size)):
+            around = np.stack([np.cos(x[rows]), np.sin(x[rows])], axis=1)
+            along, across = around @ np.stack([cosine, sine]), around @ np.stack([-sine, cosine])  # cos, sin of x - q
+            kappa, slope, curvature = PROFILES[self.profile](scale * (1.0 - along), slopes=True)
+            first, second = scale * across, scale * along  # derivatives of the squared distance
             sums = (kappa, slope * first, curvature * first**2 + slope * second)
-            parts.append(np.stack([s @ self.weights for s in sums], axis=1))
-        return np.concatenate(parts)
-
-    def _blocks(self, count: int) -> Iterator[slice]:
-        size = max(BLOCK // max(len(self.angles), 1), 1)
-        return (slice(first, first + size) for first in range(0, count, size))
-
-    @staticmethod
-    def _around(x: Array) -> Array:
-        return np.stack([np.cos(x), np.sin(x)], axis=1)
-
-    @cached_property
-    def _scale(self) -> float:
-        return 2.0 / self.lengthscale**2
-
-    @cached_property
-    def _circle(self) -> Array:
-        return np.stack([np.cos(self.angles), np.sin(self.angles)])
-
-    @cached_property
-    def _quarter(self) -> Array:
-        return np.stack([-np.sin(self.angles), np.cos(self.angles)])
+            out[rows] = np.stack([s @ self.weights for s in sums], axis=1)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,50 +160,63 @@ class JointTables:
     """Functions of single joints at every stage.
 
     Args:
-        joints: numbers of the L joints, ascending.
+        joints: numbers of the L joints, ascending, as an index.
         stages: for every stage a table per joint.
+        selection: (L, n) units of these joints.
+        shifts: (L,) of the circles of the joints, which lie side by side on a line.
+        starts: (S, power of 2) first knots of the cells of a stage on this line, ascending; of each circle's first cell
+            a place before it. cells: (S, K, 7) first knot, and coefficients of (x - knot)^0 ... (x - knot)^5.
     """
 
-    joints: tuple[int, ...]
+    joints: slice | list[int]
     stages: tuple[tuple[Table, ...], ...]
+    selection: Array
+    shifts: Array
+    starts: Array
+    cells: Array
 
-    def values(self, stage: int, x: Array) -> Array:
-        """f of every joint: x (N, n) -> (N, L)."""
-        return _quintic(*self._cells(stage, x))
+    @classmethod
+    def of(cls, joints: Sequence[int], stages: Sequence[Sequence[Table]], size: int) -> JointTables:
+        """Tables of these joints of n at every stage."""
+        shifts = CIRCLE_SPACING_RAD * np.arange(len(joints), dtype=np.float64)
+        most = max(sum(len(table.knots) - 1 for table in tables) for tables in stages)
+        starts = np.full((len(stages), 1 << most.bit_length()), CIRCLE_SPACING_RAD * (len(joints) + 1))
+        cells = np.zeros((len(stages), most, 7))
+        for stage, tables in enumerate(stages):
+            knots = np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, shifts, strict=True)])
+            found = np.column_stack([knots, np.concatenate([t.coefficients for t in tables], axis=1).T])
+            first = np.isin(knots, shifts)
+            starts[stage, : len(knots)], cells[stage, : len(knots)] = knots - 1.0 * first, found
+        return cls(as_index(joints), tuple(map(tuple, stages)), np.eye(size)[list(joints)], shifts, starts, cells)
 
-    def derivatives(self, stage: int, x: Array) -> tuple[Array, Array]:
-        """f and the derivative of the interpolated f, of every joint: x (N, n) -> (N, L) each."""
-        c, u = self._cells(stage, x)
-        return _quintic(c, u), (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
-
-    def _cells(self, stage: int, x: Array) -> tuple[Array, Array]:
-        """Coefficients (6, N, L) of the polynomials around x, and the places (N, L) from their knots."""
-        starts, coefficients = self._lines[stage]
-        t = np.mod(x[:, self._columns], TURN) + self._shifts
-        index = np.searchsorted(starts, t, side="right") - 1
-        return coefficients[:, index], t - starts[index]
-
-    @cached_property
-    def _columns(self) -> slice | list[int]:
-        return as_index(self.joints)
-
-    @cached_property
-    def _shifts(self) -> Array:
-        return CIRCLE_SPACING_RAD * np.arange(len(self.joints), dtype=np.float64)
-
-    @cached_property
-    def _lines(self) -> list[tuple[Array, Array]]:
-        """For every stage the cells of all joints on one line: their first knots (K,) and coefficients (6, K)."""
-        return [
-            (
-                np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, self._shifts, strict=True)]),
-                np.concatenate([t.coefficients for t in tables], axis=1),
-            )
-            for tables in self.stages
-        ]
+    def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
+        """f of every joint in its component (N, n), and the derivative of the interpolated f, (N, n, n)."""
+        value, u, c = tabulated(self, stage, x, np.floor, rows_around)
+        slope = (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
+        return value @ self.selection, (slope @ self.selection)[..., None] * np.eye(x.shape[1])
 
 
-def _quintic(c: Array, u: Array) -> Array:
+def tabulated(
+    tables: Any, stage: int, x: Any, floor: Callable[[Any], Any], around: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any, list[Any]]:
+    """f of every joint (N, L) at x (N, n), the distances (N, L) from the knots, and the coefficients there.
+
+    Args:
+        tables: the constants of :class:`JointTables`, as arrays of a library. floor: of it. around: as rows_around.
+    """
+    angle = x[..., tables.joints]
+    t = angle - TURN * floor(angle * (1.0 / TURN)) + tables.shifts
+    cells = around(tables.starts[stage], tables.cells[stage], t)
+    start, *c = (cells[..., k] for k in range(7))
+    return _quintic(c, t - start), t - start, c
+
+
+def rows_around(starts: Array, cells: Array, t: Array) -> Array:
+    """The rows (..., 7) of cells (K, 7) that begin at the last starts before t."""
+    return cells[np.searchsorted(starts, t, side="right") - 1]
+
+
+def _quintic(c: Any, u: Any) -> Any:
     return ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
 
 
@@ -244,7 +231,7 @@ def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
     while open_cells.any():
         middles = 0.5 * (knots[:-1] + knots[1:])[open_cells]
         c, u = Table(knots, values).coefficients[:, open_cells], middles - knots[:-1][open_cells]
-        wrong = np.abs(_quintic(c, u) - sum(s.values(middles) for s in sums)) > limit
+        wrong = np.abs(_quintic(c, u) - _derivatives(sums, middles)[:, 0]) > limit
         if len(knots) + int(wrong.sum()) > MOST_CELLS:
             return None
         cells = np.flatnonzero(open_cells)[wrong]

@@ -76,7 +76,7 @@ class Targets:
 
     @cached_property
     def across(self) -> Array:
-        """(..., r, 3) unit vectors about which turns count: r = 3 for poses, 2 beside a single axis, 0 for positions."""
+        """(..., r, 3) unit vectors about which turns count: 3 of poses, 2 beside a single axis, 0 of positions."""
         count = self.axes.shape[3]
         if count != 1:
             return np.eye(3)[:count]
