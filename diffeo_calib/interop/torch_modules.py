@@ -59,13 +59,13 @@ def _profile(name: str, r2: Tensor) -> Tensor:
     return PROFILES[name].derivative(r2, 0)
 
 
-def _rows_around(starts: Tensor, cells: Tensor, t: Tensor) -> Tensor:
+def _cells_around(starts: Tensor, cells: Tensor, t: Tensor) -> Sequence[Tensor]:
     """See runtime/tables.py: by halving, since ONNX has no search in sorted numbers."""
     place = torch.zeros_like(t, dtype=torch.int64)
     for power in reversed(range(len(starts).bit_length() - 1)):
         further = place + (1 << power)
         place = torch.where(starts[further] <= t, further, place)
-    return embedding(place, cells)
+    return embedding(place, cells.mT).unbind(-1)
 
 
 def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tensor:
@@ -77,5 +77,5 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
 
 TORCH = Operations(torch.sin, torch.cos, torch.stack, torch.broadcast_to, twist_transform, rigid_inverse)
 TORCH_FLOW = FlowOperations(
-    torch.sin, torch.cos, torch.floor, torch.cat, torch.ones_like, _at_least, _profile, _rows_around, _combined
+    torch.sin, torch.cos, torch.floor, torch.cat, torch.ones_like, _at_least, _profile, _cells_around, _combined
 )

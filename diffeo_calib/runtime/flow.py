@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array
-from diffeo_calib.runtime.tables import PROFILES, JointTables, rows_around, tabulated
+from diffeo_calib.runtime.tables import PROFILES, JointTables, cells_around, tabulated
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""
@@ -62,7 +63,7 @@ class RadialTerm:
         """
         F, r2 = squared_distances(self, stage, x, NUMPY)
         (N, n), D = x.shape, F.shape[1]
-        kappa, derivative, _ = PROFILES[self.profile](r2, slopes=True)
+        kappa, derivative = islice(PROFILES[self.profile](r2), 2)
         both = derivative @ self._products[stage]
         slope = 2.0 * (both[:, :n, None] * F[:, None, :] - both[:, n:].reshape(N, n, D))
         out, L = np.zeros((N, n, n)), len(self.centre)
@@ -150,8 +151,8 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
 class FlowOperations(NamedTuple):
     """Functions of an array library for flows: NumPy's here, torch's in interop/torch_modules.py.
 
-    ``rows_around`` is that of tables.py, ``profile`` a radial function by its name, ``at_least`` the larger of a number
-    and a constant, and ``combined`` the sum of a Runge-Kutta stage.
+    ``profile`` is a radial function by its name, ``at_least`` the larger of values and a number, ``combined`` the state
+    at a Runge-Kutta stage, ``cells_around`` that of tables.py.
     """
 
     sin: Callable[[Any], Any]
@@ -161,16 +162,20 @@ class FlowOperations(NamedTuple):
     ones_like: Callable[[Any], Any]
     at_least: Callable[[Any, float], Any]
     profile: Callable[[str, Any], Any]
-    rows_around: Callable[[Any, Any, Any], Any]
+    cells_around: Callable[[Any, Any, Any], Any]
     combined: Callable[[Any, Any, Sequence[Any]], Any]
 
 
 def _profile(name: str, r2: Array) -> Array:
-    return PROFILES[name](r2)[0]
+    return next(PROFILES[name](r2))
+
+
+def _at_least(values: Array, floor: float) -> Array:
+    return np.maximum(values, floor, out=values)
 
 
 NUMPY = FlowOperations(
-    np.sin, np.cos, np.floor, np.concatenate, np.ones_like, np.maximum, _profile, rows_around, combined
+    np.sin, np.cos, np.floor, np.concatenate, np.ones_like, _at_least, _profile, cells_around, combined
 )
 
 
@@ -191,7 +196,7 @@ def _velocities(flow: Any, stage: int, x: Any, use: FlowOperations) -> Iterator[
     for term in flow.terms:
         yield use.profile(term.profile, squared_distances(term, stage, x, use)[1]) @ term.weights[stage]
     if flow.tables is not None:
-        yield tabulated(flow.tables, stage, x, use.floor, use.rows_around)[0] @ flow.tables.selection
+        yield tabulated(flow.tables, stage, x, use.floor, use.cells_around)[0] @ flow.tables.selection
 
 
 def squared_distances(term: Any, stage: int, x: Any, use: FlowOperations) -> tuple[Any, Any]:
