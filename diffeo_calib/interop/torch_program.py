@@ -7,7 +7,8 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from typing import Any, cast
@@ -135,15 +136,18 @@ def export_torch(
         InputError: as :class:`TorchProgram`, or a file that cannot be written.
         NumericalError: the program disagrees with the model.
     """
-    check_writable(path)  # recording takes too long to find out afterwards
-    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
-    contents = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, about its inner workings
-        program = record(module, model, dtype)
+    contents, q = io.BytesIO(), _example(model, dtype)
+    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
         extra = {DESCRIPTION: json.dumps(description(model, output, frame))}
         torch.export.save(program, contents, extra_files=extra)
-    check_program(program.module(), model, output, tool=tool, frame=frame, dtype=dtype)
+        found = program.module()(q)
+    expected = model(q.double())
+    if isinstance(model, CalibratedKinematics) and output != "points":
+        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
+    difference = float((found - expected).abs().max())
+    if not difference <= PRECISIONS[dtype]:
+        what = f"the recorded program differs from the model by {difference:.2g} m"
+        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
     write_whole(path, contents.getvalue())
 
 
@@ -174,42 +178,24 @@ def export_onnx(
     except ImportError as error:
         what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
         raise InputError.of(what, fix=fix) from error
-    check_writable(path)  # recording takes too long to find out afterwards
-    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, about its inner workings
-        proto = onnx_model(record(module, model, dtype), "q", output)
+    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
+        proto = onnx_model(program, "q", output)
     for key, value in description(model, output, frame).items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())
 
 
-def record(
-    module: nn.Module, model: CalibratedKinematics | FittedMap, dtype: torch.dtype = torch.float64
-) -> torch.export.ExportedProgram:
-    """The exported program of a module on joint values of a model, for any number of rows."""
-    example = (_example(model, dtype),)
-    return torch.export.export(module.eval(), example, dynamic_shapes=({0: torch.export.Dim("rows")},), strict=False)
-
-
-def check_program(
-    program: Callable[[Tensor], Tensor],
-    model: CalibratedKinematics | FittedMap,
-    output: str,
-    *,
-    tool: object,
-    frame: str,
-    dtype: torch.dtype,
-) -> None:
-    """Raise NumericalError unless a program gives what the model gives, see :class:`TorchProgram`."""
-    q = _example(model, dtype)
-    expected = model(q.double())
-    if isinstance(model, CalibratedKinematics) and output != "points":
-        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
-    difference = float((program(q) - expected).abs().max())
-    if not difference <= PRECISIONS[dtype]:
-        what = f"the recorded program differs from the model by {difference:.2g} m"
-        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
+@contextmanager
+def _recorded(
+    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str, **options: Any
+) -> Iterator[torch.export.ExportedProgram]:
+    """The exported program for any number of rows; InputError for a path that cannot be written."""
+    check_writable(path)  # recording takes too long to find out afterwards
+    module = TorchProgram(model, output, **options).eval()
+    example, rows = (_example(model, options["dtype"]),), ({0: torch.export.Dim("rows")},)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, about its inner workings
+        yield torch.export.export(module, example, dynamic_shapes=rows, strict=False)
 
 
 def description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:

@@ -239,20 +239,15 @@ class Tree:
         Raises:
             InputError: wrong shape, or values that are not finite.
         """
-        return self.frames(q)[1]
+        tips = self.tip_poses(q)
+        return tips if len(self.tips) > 1 else tips[:, 0]
 
     def joint_frames(self, q: Tensor) -> Tensor:
         """Poses (N, n_all, 4, 4) of all moving joints' frames in the base: after ``O_l``, before the motion ``J_l``.
 
         The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
         """
-        return self.frames(q)[0]
-
-    def frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Joint frames (N, n_all, 4, 4), see :meth:`joint_frames`, and poses of the tip, see :meth:`__call__`."""
-        places = self.places(q)
-        tips = places[:, self.tip_places]
-        return places[:, : self.moving], tips if len(self.tips) > 1 else tips[:, 0]
+        return self.places(q)[:, : self.moving]
 
     def tip_poses(self, q: Tensor) -> Tensor:
         """Poses of all tips in the base, (N, tips, 4, 4) [m], also of a single one."""

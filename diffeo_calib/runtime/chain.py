@@ -173,14 +173,7 @@ class CalibratedChain:
 
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
-        if self.waves is None:
-            return self._poses_and_jacobian(q)
-        tips, slopes = self._poses_and_jacobian(turned(self.waves, q))
-        return tips, slopes * self.waves.slopes(q)[:, None, None]
-
-    def _poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """The same for joint values that include their waves."""
-        motions, L = joint_motions(self, q), len(self.axes)
+        motions, L = joint_motions(self, q if self.waves is None else turned(self.waves, q)), len(self.axes)
         nominal = None if self.sag is None else nominal_frames(self.sag, motions)
         twists = self.twists[None] if nominal is None else error_twists(self, nominal)
         offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
@@ -196,15 +189,16 @@ class CalibratedChain:
         linear = np.where(self.revolute[:, None], cross(z, arms), z) * on_path
         angular = np.where(self.revolute[:, None], z, 0.0) * on_path
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
-        if nominal is None or self.sag is None:
-            return tips, by_moving @ self.coupling
-        amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
-        slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
-        shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
-        turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
-        moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
-        sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
-        return tips, (by_moving + np.concatenate(sums, axis=2)) @ self.coupling
+        if self.sag is not None:
+            amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
+            slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
+            shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
+            turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
+            moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
+            sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
+            by_moving = by_moving + np.concatenate(sums, axis=2)
+        found = by_moving @ self.coupling
+        return tips, found if self.waves is None else found * self.waves.slopes(q)[:, None, None]
 
 
 def tip_poses(chain: Any, q: Any, use: Operations = NUMPY) -> Any:

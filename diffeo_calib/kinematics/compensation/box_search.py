@@ -268,20 +268,11 @@ def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
         InputError: not a positive number, or one for each joint.
     """
     usual = scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
-    return usual if bound is None else _by_joint(chain, bound, "bound", usual)
+    return usual if bound is None else by_joint(chain, bound, "bound", usual)
 
 
-def rates(chain: Tree, rate: object, usual: Array) -> Array:
-    """(n,) how fast a correction may change; ``usual`` (n,) is taken for prismatic joints if one number is given.
-
-    Raises:
-        InputError: not a positive number, or one for each joint.
-    """
-    return _by_joint(chain, rate, "rate", usual)
-
-
-def _by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
-    """One number for all turning joints, or one for each joint."""
+def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
+    """A positive number for all turning joints, ``usual`` (n,) for the others, or one number for each joint: (n,)."""
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
     return positive(value, name, (chain.n,)).numpy().copy()

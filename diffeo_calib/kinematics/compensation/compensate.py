@@ -28,7 +28,13 @@ from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.compensation.box_search import box_search, joint_limits, largest_motion, mobilities, rates
+from diffeo_calib.kinematics.compensation.box_search import (
+    box_search,
+    by_joint,
+    joint_limits,
+    largest_motion,
+    mobilities,
+)
 from diffeo_calib.kinematics.compensation.chord import Box, reached
 from diffeo_calib.kinematics.compensation.kinematics import tool_functions
 from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Solution, Status
@@ -220,7 +226,7 @@ def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object,
         got = f"{times[late[0] + 1]:g} after {times[late[0]]:g}"
         raise InputError.of(f"`time`, row {late[0] + 1}", expected="increasing times", got=got, fix="sort the rows")
     slowest = problem.bound * (ROWS_PER_BOUND if time is None else 1.0)
-    return Pace(times, slowest if rate is None else rates(robot, rate, slowest))
+    return Pace(times, slowest if rate is None else by_joint(robot, rate, "rate", slowest))
 
 
 def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[str, Tensor]:

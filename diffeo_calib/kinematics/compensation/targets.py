@@ -152,21 +152,6 @@ def finite_rows(value: object, name: str, shape: tuple[int | str, ...], fix: str
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def for_each_tip(targets: Tensor, robot: Tree) -> bool:
-    """Whether the targets (N, T, 4, 4) or (N, T, 3) are those of all tips, rather than (N, 4, 4) or (N, 3) of one.
-
-    Raises:
-        InputError: another number of tips than the robot has.
-    """
-    if targets.ndim != 4 and not (targets.ndim == 3 and targets.shape[2] == 3):
-        return False
-    if targets.shape[1] != len(robot.tips):
-        fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"
-        what = f"`targets` of robot '{robot.name}'"
-        raise InputError.of(what, expected=f"{len(robot.tips)} tips", got=targets.shape[1], fix=fix)
-    return True
-
-
 def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, tool_axis: str, lever: float) -> Targets:
     """Targets (N, 4, 4) or (N, 3) of one tool, or (N, T, 4, 4) or (N, T, 3) of all, NaN where a tool may be anywhere.
 
@@ -176,14 +161,17 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, to
         tool_axis: that axis, "x", "y" or "z". lever: how orientation weighs against position, m.
 
     Raises:
-        InputError: wrong shapes, values that are not finite, no rigid transforms, no directions, or a row in which all
-            tools are free.
+        InputError: wrong shapes, another number of tips than the robot's, values that are not finite, no rigid
+            transforms, no directions, or a row in which all tools are free.
     """
     fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
-    if not for_each_tip(targets, robot):
+    if targets.ndim != 4 and not (targets.ndim == 3 and targets.shape[2] == 3):
         finite_rows(targets, "targets", (rows, 4, 4) if targets.ndim == 3 else (rows, 3), fix)
         return Targets(**_parts(targets[:, None], axis, tool_axis, "row {}".format), lever=lever)
     tips, one = targets.shape[1], targets.shape[2:]
+    if tips != len(robot.tips):
+        fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"
+        raise InputError.of(f"`targets` of robot '{robot.name}'", expected=f"{len(robot.tips)} tips", got=tips, fix=fix)
     free = targets[..., :3, :].isnan().flatten(2).all(2) if len(one) == 2 else targets.isnan().all(2)
     idle = free.all(1).nonzero()[:, 0].tolist()
     if idle:
