@@ -18,8 +18,7 @@ from torch.nn.functional import embedding
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.chain import Operations
-from diffeo_calib.runtime.flow import FlowOperations
+from diffeo_calib.runtime.flow import Operations
 
 
 class Constants(nn.Module):
@@ -75,7 +74,7 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
     return x + (torch.stack(list(slopes)) * coefficients[: len(slopes), None, None]).sum(0)
 
 
-TORCH = Operations(torch.sin, torch.cos, torch.stack, torch.broadcast_to, twist_transform, rigid_inverse)
-TORCH_FLOW = FlowOperations(
-    torch.sin, torch.cos, torch.floor, torch.cat, torch.ones_like, _at_least, _profile, _cells_around, _combined
+TORCH = Operations(
+    *(torch.sin, torch.cos, torch.floor, torch.stack, torch.cat, torch.ones_like, torch.broadcast_to),
+    *(_at_least, _profile, _cells_around, _combined, twist_transform, rigid_inverse),
 )

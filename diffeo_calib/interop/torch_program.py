@@ -20,7 +20,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.torch_modules import TORCH, TORCH_FLOW, Constants
+from diffeo_calib.interop.torch_modules import TORCH, Constants
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
@@ -108,9 +108,9 @@ class _ConstantPoints(Constants):
     """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
 
     def forward(self, q: Tensor) -> Tensor:
-        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH_FLOW), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
+        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
         placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH_FLOW).reshape(-1, self.markers.numel())
+        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH).reshape(-1, self.markers.numel())
 
 
 def export_torch(

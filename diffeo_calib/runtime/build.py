@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.runtime.arrays import Array, Tableau, as_index
-from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
+from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
+from diffeo_calib.runtime.chain import CalibratedChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 

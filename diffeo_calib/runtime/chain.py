@@ -12,49 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import factorial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array, cross
+from diffeo_calib.runtime.arrays import ONE, Array, cross, skew, transforms
+from diffeo_calib.runtime.flow import NUMPY, Operations
 
 SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
-
-
-_ONE = np.eye(3)
-_SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
-"""w @ _SKEW is [w]x, row by row."""
-
-
-def skew(w: Array) -> Array:
-    """[w]x: (..., 3) -> (..., 3, 3)."""
-    return (w @ _SKEW).reshape(*w.shape, 3)
-
-
-def transforms(twists: Array) -> Array:
-    """T(t, w) of the module's docstring: (..., 6) -> (..., 4, 4)."""
-    w = twists[..., 3:]
-    x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    a = np.sqrt(x)
-    out = np.zeros((*twists.shape[:-1], 4, 4))
-    out[..., :3, :3] = _ONE + np.sinc(a / np.pi) * W + 0.5 * np.sinc(a / (2 * np.pi)) ** 2 * (W @ W)
-    out[..., :3, 3], out[..., 3, 3] = twists[..., :3], 1.0
-    return out
-
-
-class Operations(NamedTuple):
-    """Functions of an array library for poses: NumPy's here, torch's in interop/torch_modules.py."""
-
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
-    stack: Callable[[Any, int], Any]
-    broadcast_to: Callable[[Any, Any], Any]
-    transforms: Callable[[Any], Any]
-    inverse: Callable[[Any], Any]
-
-
-NUMPY = Operations(np.sin, np.cos, np.stack, np.broadcast_to, transforms, np.linalg.inv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +253,7 @@ def _right_jacobian(w: Array) -> Array:
     """Jr of SO(3): (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     return (
-        _ONE
+        ONE
         - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W
         + smooth(x, 3, lambda a: (a - np.sin(a)) / a**3, np.where) * (W @ W)
     )

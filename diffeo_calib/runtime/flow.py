@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.arrays import Array, transforms
 from diffeo_calib.runtime.tables import PROFILES, JointTables, cells_around, tabulated
 
 BLOCK = 1 << 16
@@ -148,22 +148,26 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
     return x
 
 
-class FlowOperations(NamedTuple):
-    """Functions of an array library for flows: NumPy's here, torch's in interop/torch_modules.py.
+class Operations(NamedTuple):
+    """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_modules.py.
 
     ``profile`` is a radial function by its name, ``at_least`` the larger of values and a number, ``combined`` the state
-    at a Runge-Kutta stage, ``cells_around`` that of tables.py.
+    at a Runge-Kutta stage, ``cells_around`` that of tables.py, ``inverse`` of rigid transforms.
     """
 
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
     floor: Callable[[Any], Any]
+    stack: Callable[[Any, int], Any]
     concatenate: Callable[[Any, int], Any]
     ones_like: Callable[[Any], Any]
+    broadcast_to: Callable[[Any, Any], Any]
     at_least: Callable[[Any, float], Any]
     profile: Callable[[str, Any], Any]
     cells_around: Callable[[Any, Any, Any], Any]
     combined: Callable[[Any, Any, Sequence[Any]], Any]
+    transforms: Callable[[Any], Any]
+    inverse: Callable[[Any], Any]
 
 
 def _profile(name: str, r2: Array) -> Array:
@@ -174,12 +178,13 @@ def _at_least(values: Array, floor: float) -> Array:
     return np.maximum(values, floor, out=values)
 
 
-NUMPY = FlowOperations(
-    np.sin, np.cos, np.floor, np.concatenate, np.ones_like, _at_least, _profile, cells_around, combined
+NUMPY = Operations(
+    *(np.sin, np.cos, np.floor, np.stack, np.concatenate, np.ones_like, np.broadcast_to),
+    *(_at_least, _profile, cells_around, combined, transforms, np.linalg.inv),
 )
 
 
-def advanced(flow: Any, x: Any, use: FlowOperations) -> Any:
+def advanced(flow: Any, x: Any, use: Operations) -> Any:
     """The end of the flow of points (N, n), by the constants of a :class:`RecordedFlow` as arrays of a library."""
     for step in range(flow.steps):
         slopes: list[Any] = []
@@ -191,7 +196,7 @@ def advanced(flow: Any, x: Any, use: FlowOperations) -> Any:
     return x
 
 
-def _velocities(flow: Any, stage: int, x: Any, use: FlowOperations) -> Iterator[Any]:
+def _velocities(flow: Any, stage: int, x: Any, use: Operations) -> Iterator[Any]:
     """The parts of v_s at points (N, n)."""
     for term in flow.terms:
         yield use.profile(term.profile, squared_distances(term, stage, x, use)[1]) @ term.weights[stage]
@@ -199,7 +204,7 @@ def _velocities(flow: Any, stage: int, x: Any, use: FlowOperations) -> Iterator[
         yield tabulated(flow.tables, stage, x, use.floor, use.cells_around)[0] @ flow.tables.selection
 
 
-def squared_distances(term: Any, stage: int, x: Any, use: FlowOperations) -> tuple[Any, Any]:
+def squared_distances(term: Any, stage: int, x: Any, use: Operations) -> tuple[Any, Any]:
     """Features F of points: lines about the controls' centre, cosines, sines (N, D); |F - F_j|^2 (N, C)."""
     L, angles = len(term.centre), x[..., term.circles]
     lines = (x[..., term.lines] - term.centre) * term.scales[:L]
