@@ -107,6 +107,9 @@ class TorchProgram(nn.Module):
 class _ConstantPoints(Constants):
     """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
 
+    markers: Tensor
+    on: tuple[int, ...]
+
     def forward(self, q: Tensor) -> Tensor:
         tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
         placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
