@@ -25,8 +25,8 @@ def flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]:
         "size": flow.size,
         "steps": flow.steps,
         "stages": len(flow.weights),
-        "coefficients": flow.coefficients / flow.steps,
-        "weights": flow.weights / flow.steps,
+        "coefficients": flow.coefficients,
+        "weights": flow.weights,
         "terms": [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)],
         "tables": None if flow.tables is None else _table_constants(flow.tables),
     }
@@ -41,16 +41,18 @@ def _term_constants(name: str, term: RadialTerm) -> dict[str, Any]:
     """
     outputs = np.flatnonzero(term.weights.any(axis=(0, 1)))
     width = len(outputs) + (len(outputs) % 2 if len(outputs) > 1 else 0)
+    every, features = np.arange(term.weights.shape[2]), term.features
     weights = np.pad(term.weights[..., outputs], ((0, 0), (0, 0), (0, width - len(outputs))))
     return {
         "name": name,
         "term": term,
-        "inputs": [*term.lines, *term.circles],
+        "inputs": np.concatenate([every[term.lines], every[term.circles]]),
+        "lines": len(term.centre),
         "outputs": outputs,
         "width": width,
-        "features": _blocks(term.features).swapaxes(2, 3),
+        "features": _blocks(features).swapaxes(2, 3),
         "weights": _blocks(weights),
-        "constant": float((term.scales[len(term.lines) :] ** 2).sum()),
+        "constant": float((term.scales[len(term.centre) :] ** 2).sum()),
     }
 
 
@@ -67,7 +69,7 @@ def _table_constants(tables: JointTables) -> dict[str, Any]:
     """
     every = [table for stage in tables.stages for table in stage]
     return {
-        "joints": tables.joints,
+        "joints": np.flatnonzero(tables.selection.any(0)),
         "first": [0, *np.cumsum([len(table.knots) for table in every]).tolist()],
         "knots": np.concatenate([table.knots for table in every]),
         "derivatives": np.concatenate([table.values for table in every]),

@@ -67,29 +67,6 @@ class CFiles:
         write_together(self.contents)
 
 
-@dataclass(frozen=True, eq=False)
-class Settings:
-    """Constants built into a source, apart from the program.
-
-    Args:
-        tool: (4, 4) tool centre point in the tip's frame [m].
-        frame: (4, 4) transform from the measuring frame to that of the results [m].
-        limits: (n, 2) of the active joints [rad or m].
-        robot: its name.
-        joints: a line per active joint.
-        frame_name: the frame of the results.
-        remarks: sentences about the tool and the model.
-    """
-
-    tool: Array
-    frame: Array
-    limits: Array
-    robot: str
-    joints: Sequence[str]
-    frame_name: str
-    remarks: Sequence[str] = ()
-
-
 def write_c(
     model: CalibratedKinematics,
     path: str | PathLike[str],
@@ -146,50 +123,54 @@ def c_files(
         what = "this model cannot be written as C"
         raise InputError.of(what, expected="constant time steps, kernels of known profiles, the CPU", fix=fix)
     program = program.at(carrier)
-    return CFiles(source, header, name, c_source(program, _settings(model, program, tool, frame), source.stem, name))
+    if frame not in FRAME_NAMES:
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAME_NAMES)), got=as_written(frame))
+    chosen, robot = (model.tool if tool is None else tool_transform(tool)).numpy(), model.robot
+    texts = c_source(
+        program,
+        source.stem,
+        name,
+        tool=chosen,
+        frame=inverse(program.chain.start) if frame == "base" else np.eye(4),
+        limits=robot.limits.numpy(),
+        robot=_comment(robot.name),
+        joints=[_comment(line) for line in _joints(model)],
+        frame_name=FRAME_NAMES[frame],
+        remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
+    )
+    return CFiles(source, header, name, texts)
 
 
-def c_source(program: Program, settings: Settings, stem: str, prefix: str) -> tuple[str, str]:
+def c_source(
+    program: Program, stem: str, prefix: str, *, tool: Array, frame: Array, limits: Array, **texts: Any
+) -> tuple[str, str]:
     """Source and header of a program.
 
     Args:
-        program: the model. settings: tool, frame and descriptions.
-        stem: name of the files without ``.c`` and ``.h``. prefix: of the functions' names.
+        program: the model. stem: name of the files without ``.c`` and ``.h``. prefix: of the functions' names.
+        tool: (4, 4) tool centre point in the tip's frame [m].
+        frame: (4, 4) transform from the measuring frame to that of the results [m].
+        limits: (n, 2) of the active joints [rad or m].
+        texts: ``robot``, its name; ``joints``, a line for each; ``frame_name`` of the results; ``remarks``, sentences.
     """
-    everything = {**_texts(program, settings, stem, prefix), **_constants(program, settings)}
-    source, header = (_ENVIRONMENT.get_template(f"model.{kind}.jinja").render(everything) for kind in ("c", "h"))
-    return source, header
-
-
-def _texts(program: Program, settings: Settings, stem: str, prefix: str) -> dict[str, Any]:
-    return {
-        "stem": stem,
-        "prefix": prefix,
-        "macro": prefix.upper(),
-        "n": program.chain.n,
-        "markers": len(program.markers),
-        "generated": f"{GENERATED} {package_version()}",
-        "robot": _comment(settings.robot),
-        "joints": [_comment(line) for line in settings.joints],
-        "frame_name": settings.frame_name,
-        "remarks": [_comment(line) for line in settings.remarks],
-    }
-
-
-def _constants(program: Program, settings: Settings) -> dict[str, Any]:
-    chain = program.chain
+    chain, joints = program.chain, len(program.chain.axes)
     named = (
         ("joint", "phi^-1: corrections of the joints", program.joint_flow),
         ("task", "psi: corrections of positions", program.task_flow),
     )
     flows = [flow_constants(*flow) for flow in named if not flow[2].vanishes]
     terms = [term for flow in flows for term in flow["terms"]]
-    coupled = not np.array_equal(chain.coupling, np.eye(len(chain.axes))) or bool(chain.coupling_offset.any())
-    return {
+    contents = texts | {
+        "stem": stem,
+        "prefix": prefix,
+        "macro": prefix.upper(),
+        "n": chain.n,
+        "markers": len(program.markers),
+        "generated": f"{GENERATED} {package_version()}",
         "lanes": LANES,
         "tree": not chain.serial,
-        "parents": chain.before[: len(chain.axes) + len(chain.tips)],
-        "on_path": chain.ancestors[len(chain.axes) :][: len(chain.tips)] * 1,
+        "parents": chain.before[: joints + len(chain.tips)],
+        "on_path": chain.ancestors[joints:][: len(chain.tips)] * 1,
         "groups": [(tip, *run) for tip, run in _runs(program.on)],
         "program_tip": program.tip,
         "flows": flows,
@@ -199,16 +180,18 @@ def _constants(program: Program, settings: Settings) -> dict[str, Any]:
         "tabulated": any(flow["tables"] for flow in flows),
         "chain": chain,
         "waves": chain.waves,
-        "moving": len(chain.axes),
+        "moving": joints,
         "slides": not chain.revolute.all(),
-        "coupled": coupled,
+        "coupled": not np.array_equal(chain.coupling, np.eye(joints)) or bool(chain.coupling_offset.any()),
         "sag": None if chain.sag is None else sag_constants(chain, chain.sag),
         "markers_in_flange": program.markers,
-        "tool_points": tool_points(settings.tool, TOOL_LEVER),
-        "framed": not np.array_equal(settings.frame, np.eye(4)),
-        "frame": settings.frame,
-        "limits": settings.limits,
+        "tool_points": tool_points(tool, TOOL_LEVER),
+        "framed": not np.array_equal(frame, np.eye(4)),
+        "frame": frame,
+        "limits": limits,
     }
+    source, header = (_ENVIRONMENT.get_template(f"model.{kind}.jinja").render(contents) for kind in ("c", "h"))
+    return source, header
 
 
 def _runs(on: Sequence[int]) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -218,21 +201,6 @@ def _runs(on: Sequence[int]) -> Iterator[tuple[int, tuple[int, int]]]:
         count = len(list(run))
         yield tip, (first, count)
         first += count
-
-
-def _settings(model: CalibratedKinematics, program: Program, tool: object, frame: str) -> Settings:
-    if frame not in FRAME_NAMES:
-        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAME_NAMES)), got=as_written(frame))
-    chosen = (model.tool if tool is None else tool_transform(tool)).numpy()
-    return Settings(
-        tool=chosen,
-        frame=inverse(program.chain.start) if frame == "base" else np.eye(4),
-        limits=model.robot.limits.numpy(),
-        robot=model.robot.name,
-        joints=_joints(model),
-        frame_name=FRAME_NAMES[frame],
-        remarks=_remarks(model, chosen, program.tips[program.tip]),
-    )
 
 
 def _joints(model: CalibratedKinematics) -> list[str]:

@@ -89,33 +89,28 @@ def load(
 
 
 def _checked(kernels: object) -> KernelClasses:
-    """Classes of kernels and profiles by their names; classes of profiles are called without arguments."""
+    """Classes of kernels, and profiles whose derivatives are right, of classes without arguments, by their names."""
     if kernels is None:
         return {}
-    if not isinstance(kernels, Mapping) or not all(map(_is_kernel, kernels.values())):
+    given = dict(kernels) if isinstance(kernels, Mapping) else {"": None}
+    if not all(isinstance(one, Profile) or _is_class(one, (Kernel, Profile)) for one in given.values()):
         fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}, or {'my_profile': MyProfile(2.5)}"
         expected = "names -> subclasses of dc.Kernel, or profiles"
         raise InputError.of("`kernels`", expected=expected, got=as_written(kernels)[:80], fix=fix)
-    return {name: _made(given) if _is_profile(given) else given for name, given in kernels.items()}
+    for name, one in given.items():
+        if _is_class(one, Kernel):
+            continue
+        try:
+            given[name] = one() if isinstance(one, type) else one
+        except TypeError as error:
+            fix = "pass the profile with the parameters of the fit, such as kernels={'my_profile': MyProfile(2.5)}"
+            raise InputError.of(f"`kernels`: {as_written(one)} needs arguments ({error})", fix=fix) from error
+        check_profile(given[name])
+    return given
 
 
-def _is_profile(given: object) -> bool:
-    return isinstance(given, Profile) or (isinstance(given, type) and issubclass(given, Profile))
-
-
-def _is_kernel(given: object) -> bool:
-    return _is_profile(given) or (isinstance(given, type) and issubclass(given, Kernel))
-
-
-def _made(given: Profile | type[Profile]) -> Profile:
-    """A profile whose derivatives are right, of a class without arguments."""
-    try:
-        profile = given() if isinstance(given, type) else given
-    except TypeError as error:
-        fix = "pass the profile with the parameters of the fit, such as kernels={'my_profile': MyProfile(2.5)}"
-        raise InputError.of(f"`kernels`: {as_written(given)} needs arguments ({error})", fix=fix) from error
-    check_profile(profile)
-    return profile
+def _is_class(given: object, kinds: type | tuple[type, ...]) -> bool:
+    return isinstance(given, type) and issubclass(given, kinds)
 
 
 def read(path: Path) -> tuple[Header, Tensors]:

@@ -392,16 +392,15 @@ REGISTRATION = tuple(PREFIX + name for name in ARRAYS)
 SHIFT = "shift"
 NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
 UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
-ENTRIES = {*NUMBERS, "same", "free", "outliers", "undetermined", SHIFT}
+ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", SHIFT)
 LEARNT = "learnt"
 """The entry of a registration whose rows the map knows as those of a fit: no map around another one."""
 
 
 def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Its entry in the header, and its tensors."""
-    entry = {name: getattr(found, name) for name in (*NUMBERS, "same", "free")}
-    shift = None if found.shift is None else found.shift.tolist()
-    entry |= {"outliers": list(found.outliers), "undetermined": list(found.undetermined), SHIFT: shift}
+    entry = {name: getattr(found, name) for name in ENTRIES}
+    entry[SHIFT] = None if found.shift is None else found.shift.tolist()
     return entry, {PREFIX + name: getattr(found, name) for name in ARRAYS}
 
 
@@ -411,7 +410,7 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
     Raises:
         InputError: entries that are missing or do not fit together.
     """
-    if not isinstance(entry, dict) or set(entry) - {LEARNT} != ENTRIES:
+    if not isinstance(entry, dict) or set(entry) - {LEARNT} != set(ENTRIES):
         got = sorted(entry) if isinstance(entry, dict) else entry
         raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
     for name in NUMBERS:

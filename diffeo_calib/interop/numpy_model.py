@@ -58,13 +58,15 @@ class NumpyKinematics:
         Raises:
             InputError: wrong shapes, values that are not finite, or another frame.
         """
-        return self._at(tip).poses(self._joints(q), self._tool(tool), _frame(frame))
+        return self._at(tip, frame).poses(self._joints(q), self._tool(tool), frame)
 
     def tool_jacobian(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Array:
         """Derivatives of :meth:`tool_poses`: (N, 6, n) linear velocity [m/rad or m/m], then angular velocity."""
-        return self._at(tip).poses_and_jacobian(self._joints(q), self._tool(tool), _frame(frame))[1]
+        return self._at(tip, frame).poses_and_jacobian(self._joints(q), self._tool(tool), frame)[1]
 
-    def _at(self, tip: str | None) -> Program:
+    def _at(self, tip: str | None, frame: str) -> Program:
+        if frame not in FRAMES:
+            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
         if tip not in (*self.program.tips, None) or (tip is None and len(self.program.tips) > 1):
             fix = f"pass one of {', '.join(self.program.tips)}"
             raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=fix)
@@ -117,9 +119,10 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     try:
         program = _program(header, arrays)
         joints = active_joints(header["nominal"])
-        limits = [[_or(joint["lower"], -np.inf), _or(joint["upper"], np.inf)] for joint in joints]
+        limits = np.array([[joint["lower"], joint["upper"]] for joint in joints], dtype=np.float64)  # None is NaN
+        limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
         tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)
-        return NumpyKinematics(program, tuple(joint["name"] for joint in joints), np.array(limits), tool)
+        return NumpyKinematics(program, tuple(joint["name"] for joint in joints), limits, tool)
     except UNSOUND as error:
         fix = "save the model again"
         raise ModelFileError.of(f"{path} has contents that do not fit together ({error})", fix=fix) from error
@@ -131,12 +134,6 @@ def _numbers(value: object, name: str) -> Array:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         fix = "pass a numeric array, rows of equal length"
         raise InputError.of(f"`{name}` cannot be read as numbers ({error})", fix=fix) from error
-
-
-def _frame(frame: str) -> str:
-    if frame not in FRAMES:
-        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
-    return frame
 
 
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
@@ -177,7 +174,3 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     seen = arrays.get("registration_markers", markers)
     at = on if len(seen) == len(markers) else [on[0]] * len(seen)
     return Program(flows[0], k0, flows[1], seen, tuple(at), chain.tips)
-
-
-def _or(limit: float | None, default: float) -> float:
-    return default if limit is None else limit

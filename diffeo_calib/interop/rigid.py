@@ -107,17 +107,15 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
 
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
-    on = Compared.of(model, transmission=transmission)
     nominal = Geometry.nominal(model.robot).joint_errors
-    return _compared(_placed(model, nominal, on.x, on.y), "nominal kinematics", on, {})
+    return _with_errors(model, nominal, "nominal kinematics", transmission=transmission)
 
 
 def geometric_kinematics(model: CalibratedKinematics) -> RigidKinematics:
     """The geometric calibration that the model was fitted from; without one, the projection of the model."""
     if model.rigid_errors is None:
         return rigid_kinematics(model)
-    on = Compared.of(model)
-    return _compared(_placed(model, model.rigid_errors, on.x, on.y), GEOMETRIC, on, {})
+    return _with_errors(model, model.rigid_errors, GEOMETRIC)
 
 
 def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
@@ -125,8 +123,7 @@ def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, 
 
     Joint errors are kept; base and markers are those that fit best.
     """
-    on = Compared.of(model, transmission=applied)
-    return _compared(_placed(model, rigid.geometry.joint_errors, on.x, on.y), rigid.how, on, {})
+    return _with_errors(model, rigid.geometry.joint_errors, rigid.how, transmission=applied)
 
 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
@@ -186,6 +183,13 @@ class Compared(NamedTuple):
 def _compared(geometry: Geometry, how: str, on: Compared, validated: Mapping[str, float]) -> RigidKinematics:
     d = distances(geometry, on.x[on.judged], on.y[on.judged])
     return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
+
+
+def _with_errors(
+    model: CalibratedKinematics, joint_errors: Tensor, how: str, *, transmission: bool = False
+) -> RigidKinematics:
+    on = Compared.of(model, transmission=transmission)
+    return _compared(_placed(model, joint_errors, on.x, on.y), how, on, {})
 
 
 def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identification:

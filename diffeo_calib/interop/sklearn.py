@@ -81,31 +81,23 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
-        data = self._rows(self.robot, X, y) if isinstance(y, RowGroups) else self._from_arrays(self.robot, X, y)
+        robot = self.robot
+        if isinstance(y, RowGroups):
+            q, data = self._in_order(robot, validate_data(self, X, dtype=np.float64)), y
+            if not np.array_equal(q, y.q.numpy()):
+                raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
+        else:
+            hidden = _hidden(y)
+            known: Any = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
+            checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
+            points = np.array(checked[1], dtype=np.float64).reshape(len(checked[1]), -1)
+            if hidden is not None:
+                points[hidden.reshape(points.shape)] = np.nan
+            data = self._measured(robot, self._in_order(robot, checked[0]), points)
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
-        self.result_ = calibrate(self.robot, data, **chosen)
+        self.result_ = calibrate(robot, data, **chosen)
         self.model_ = self.result_.model
         return self
-
-    def _rows(self, robot: Tree, X: Any, y: Any) -> Any:
-        """Rows of any kinds whose joint values are those of X."""
-        q = np.asarray(validate_data(self, X, dtype=np.float64))
-        self._check_joints(robot, q)
-        if not np.array_equal(self._in_order(robot, q), y.q.numpy()):
-            raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
-        return y
-
-    def _from_arrays(self, robot: Tree, X: Any, y: Any) -> Measurements:
-        """The rows of two arrays."""
-        hidden = _hidden(y)
-        known: Any = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
-        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
-        q, points = checked
-        self._check_joints(robot, q)
-        points = np.asarray(points, dtype=np.float64).reshape(len(q), -1)
-        if hidden is not None:
-            points = np.where(hidden.reshape(points.shape), np.nan, points)
-        return self._measured(robot, self._in_order(robot, q), points)
 
     def _measured(self, robot: Tree, q: np.ndarray, points: np.ndarray) -> Measurements:
         """The rows as measurements; points (N, 3 P), m."""
@@ -142,8 +134,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
         """
         check_is_fitted(self, "model_")
-        checked: Any = validate_data(self, X, reset=False, dtype=np.float64)
-        q = self._in_order(self.model_.robot, checked)
+        q = self._in_order(self.model_.robot, validate_data(self, X, reset=False, dtype=np.float64))
         if not return_std:
             return self.model_(q).flatten(1).numpy()
         mean, covariance = self.model_.predict(q)
@@ -157,21 +148,14 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.regressor_tags.poor_score = True  # on tables that are no robot's
         return tags
 
-    def _check_joints(self, robot: Tree, q: np.ndarray) -> None:
-        """Raise MeasurementError unless X has the robot's joints."""
+    def _in_order(self, robot: Tree, q: Any) -> np.ndarray:
+        """Columns in the robot's order, where they have names; MeasurementError unless they are its joints."""
         names, wanted = getattr(self, "feature_names_in_", None), robot.joint_names
         if names is not None and sorted(names) != sorted(wanted):
             raise MeasurementError.of("columns of `X`", expected=", ".join(wanted), got=", ".join(names))
         if q.shape[1] != len(wanted):
             raise MeasurementError.of("`X`", expected=f"{len(wanted)} joints", got=f"{q.shape[1]} columns")
-
-    def _in_order(self, robot: Tree, q: np.ndarray) -> np.ndarray:
-        """Columns in the robot's order, where they have names."""
-        names = getattr(self, "feature_names_in_", None)
-        if names is None:
-            return q
-        order = list(names)
-        return q[:, [order.index(name) for name in robot.joint_names]]
+        return q if names is None else q[:, [list(names).index(name) for name in wanted]]
 
 
 def _hidden(y: Any) -> np.ndarray | None:

@@ -7,7 +7,9 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from typing import Any, cast
 
@@ -18,14 +20,15 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.torch_modules import ChainProgram, FlowProgram, constant
+from diffeo_calib.interop.torch_modules import TORCH, Constants
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
-from diffeo_calib.runtime.program import Program
+from diffeo_calib.runtime.chain import tip_poses
+from diffeo_calib.runtime.flow import advanced
 
 OUTPUTS = ("points", "tool_poses", "poses")
 PRECISIONS = {torch.float64: 1e-9, torch.float32: 1e-4}
@@ -85,7 +88,9 @@ class TorchProgram(nn.Module):
         if program is None and dtype != torch.float64:
             what = "a program of a model with its own functions or kernels, which are recorded as they are,"
             raise InputError.of(what, expected="torch.float64", got=dtype)
-        self.points = deformation if program is None else _ConstantPoints(program, marks)
+        if program is not None and marks is not None:
+            program = replace(program, markers=marks.numpy(), on=(program.tip,) * len(marks))
+        self.points = deformation if program is None else _ConstantPoints(program)
         self.to(dtype)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -99,25 +104,16 @@ class TorchProgram(nn.Module):
         return poses if self.to_frame is None else self.to_frame @ poses
 
 
-class _ConstantPoints(nn.Module):
+class _ConstantPoints(Constants):
     """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
 
-    marks: Tensor
-    on: Tensor
-
-    def __init__(self, program: Program, marks: Tensor | None) -> None:
-        super().__init__()
-        self.joint_flow = FlowProgram(program.joint_flow)
-        self.chain = ChainProgram(program.chain)
-        self.task_flow = FlowProgram(program.task_flow)
-        self.register_buffer("marks", constant(program.markers) if marks is None else marks)
-        on = list(program.on) if marks is None else [program.tip] * len(marks)
-        self.register_buffer("on", torch.tensor(on, dtype=torch.int64, device=HOST))
+    markers: Tensor
+    on: tuple[int, ...]
 
     def forward(self, q: Tensor) -> Tensor:
-        tips = self.chain(self.joint_flow(q)).index_select(1, self.on)  # (N, P, 4, 4)
-        placed = (tips[..., :3, :3] @ self.marks[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return self.task_flow(placed.reshape(-1, 3)).reshape(-1, self.marks.numel())
+        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
+        placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
+        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH).reshape(-1, self.markers.numel())
 
 
 def export_torch(
@@ -143,15 +139,18 @@ def export_torch(
         InputError: as :class:`TorchProgram`, or a file that cannot be written.
         NumericalError: the program disagrees with the model.
     """
-    check_writable(path)  # recording takes too long to find out afterwards
-    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
-    contents = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, about its inner workings
-        program = record(module, model, dtype)
+    contents, q = io.BytesIO(), _example(model, dtype)
+    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
         extra = {DESCRIPTION: json.dumps(description(model, output, frame))}
         torch.export.save(program, contents, extra_files=extra)
-    check_program(program.module(), model, output, tool=tool, frame=frame, dtype=dtype)
+        found = program.module()(q)
+    expected = model(q.double())
+    if isinstance(model, CalibratedKinematics) and output != "points":
+        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
+    difference = float((found - expected).abs().max())
+    if not difference <= PRECISIONS[dtype]:
+        what = f"the recorded program differs from the model by {difference:.2g} m"
+        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
     write_whole(path, contents.getvalue())
 
 
@@ -182,42 +181,24 @@ def export_onnx(
     except ImportError as error:
         what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
         raise InputError.of(what, fix=fix) from error
-    check_writable(path)  # recording takes too long to find out afterwards
-    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, about its inner workings
-        proto = onnx_model(record(module, model, dtype), "q", output)
+    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
+        proto = onnx_model(program, "q", output)
     for key, value in description(model, output, frame).items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())
 
 
-def record(
-    module: nn.Module, model: CalibratedKinematics | FittedMap, dtype: torch.dtype = torch.float64
-) -> torch.export.ExportedProgram:
-    """The exported program of a module on joint values of a model, for any number of rows."""
-    example = (_example(model, dtype),)
-    return torch.export.export(module.eval(), example, dynamic_shapes=({0: torch.export.Dim("rows")},), strict=False)
-
-
-def check_program(
-    program: Callable[[Tensor], Tensor],
-    model: CalibratedKinematics | FittedMap,
-    output: str,
-    *,
-    tool: object,
-    frame: str,
-    dtype: torch.dtype,
-) -> None:
-    """Raise NumericalError unless a program gives what the model gives, see :class:`TorchProgram`."""
-    q = _example(model, dtype)
-    expected = model(q.double())
-    if isinstance(model, CalibratedKinematics) and output != "points":
-        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
-    difference = float((program(q) - expected).abs().max())
-    if not difference <= PRECISIONS[dtype]:
-        what = f"the recorded program differs from the model by {difference:.2g} m"
-        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
+@contextmanager
+def _recorded(
+    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str, **options: Any
+) -> Iterator[torch.export.ExportedProgram]:
+    """The exported program for any number of rows; InputError for a path that cannot be written."""
+    check_writable(path)  # recording takes too long to find out afterwards
+    module = TorchProgram(model, output, **options).eval()
+    example, rows = (_example(model, options["dtype"]),), ({0: torch.export.Dim("rows")},)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, about its inner workings
+        yield torch.export.export(module, example, dynamic_shapes=rows, strict=False)
 
 
 def description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:

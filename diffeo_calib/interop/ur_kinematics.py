@@ -22,7 +22,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.dh import links, on_axis, zero_frames
@@ -32,7 +31,6 @@ from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.dh import DHRow, row_transform
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
 
@@ -47,6 +45,7 @@ JOINTS = (
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 BASE, TOOL = "base_link", "tool0"
 ENTRIES = ("x", "y", "z", "roll", "pitch", "yaw")
+HALF_TURN = row_transform(DHRow(0.0, 0.0, 0.0, pi))
 TOOL_TOLERANCE = 1e-4
 """Largest distance, m, and angle, rad, between tool0 and the axis of the last joint: on these robots it lies on it."""
 
@@ -90,9 +89,8 @@ def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:
     _, ideal_frames, tool = zero_frames(ideal)
     places = _ideal_places(ideal, ideal_frames, tool)
     _, frames, _ = zero_frames(geometry)
-    turn = _turn(pi)
     at = [
-        turn,
+        HALF_TURN,
         *(own @ torch.linalg.inv(was) @ place for own, was, place in zip(frames, ideal_frames, places, strict=True)),
     ]
     return torch.stack([torch.linalg.inv(before) @ after for before, after in pairwise(at)])
@@ -140,7 +138,7 @@ def _to_tool(chain: Tree, urdf: bytes, prefix: str) -> Tree:
 
 def _ideal_places(ideal: Geometry, frames: list[Tensor], tool: Tensor) -> list[Tensor]:
     """The file's frames of the nominal robot in its base, all joints at zero: Craig's frames, tool0 the last."""
-    rows, before, after = links(frames, ideal.chain.axes, tool, _turn(pi))
+    rows, before, after = links(frames, ideal.chain.axes, tool, HALF_TURN)
     places = [
         frame @ row_transform(DHRow(0.0, 0.0, row.d, row.theta))
         for frame, row in zip([before, *after[:-1]], rows, strict=True)
@@ -155,8 +153,3 @@ def _ideal_places(ideal: Geometry, frames: list[Tensor], tool: Tensor) -> list[T
             what, expected="a frame on the axis of the last joint", got=f"{away:.1e} beside it", fix=fix
         )
     return places
-
-
-def _turn(angle: float) -> Tensor:
-    """Rz(angle), (4, 4)."""
-    return transforms(roll_pitch_yaw(0.0, 0.0, angle), torch.zeros(3, dtype=torch.float64, device=HOST))

@@ -28,7 +28,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.joint import joint_motions, turned_axes, walk
+from diffeo_calib.robots.joint import joint_motions, walk
 from diffeo_calib.robots.se3 import right_jacobian, rigid, twist_transform
 from diffeo_calib.robots.tree import Tree
 
@@ -132,12 +132,7 @@ class Geometry:
         """Derivatives of the points by the active joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
         q = self.chain.joint_values(q)
         at = self._walk(q, self._theta(theta, q))
-        frames = at.places[:, : self.chain.moving]
-        axes = turned_axes(frames, self.chain.axes)[:, None]  # (N, 1, n_all, 3)
-        arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, n_all, 3)
-        turning, moved = self.chain.revolute.to(q.device)[:, None], self.moved.to(q.device)[..., None]
-        slopes = torch.where(turning, torch.linalg.cross(axes.expand_as(arms), arms), axes)
-        return self.chain.by_active(slopes.mul(moved).mT)
+        return self.chain.point_slopes(at.places[:, : self.chain.moving], at.points, self.moved)
 
     def sensitivities(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Derivatives of the points by the parameters: (N, P, 3, K) [m/m or m/rad], exact at every theta."""

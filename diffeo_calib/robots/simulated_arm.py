@@ -25,7 +25,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import methods_outside_inference_mode
-from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import joint_motions, turned_axes
@@ -133,7 +133,8 @@ class SimulatedArm:
         axes, origins = turned_axes(frames, self.nominal.axes), frames[..., :3, 3]  # (N, n, 3)
         links = frames @ joint_motions(self.nominal.motion_terms.to(q.device), q)  # a link moves with its joint
         centres = (links[..., :3, :3] @ self._centres.to(q.device)[..., None])[..., 0] + links[..., :3, 3]
-        held = links[:, -1] @ _held(self.nominal).to(q.device)
+        payload_centre = torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device=q.device)
+        held = links[:, -1] @ (self.nominal.tip_offsets[0].to(q.device) @ payload_centre)
         centres = torch.cat([centres, held[:, None, :3]], dim=1)
         carried = torch.as_tensor(self.payload if payload is None else payload, dtype=torch.float64, device=q.device)
         masses = torch.cat([self._masses.to(q.device).expand(len(q), -1), carried.expand(len(q))[:, None]], dim=1)
@@ -226,21 +227,9 @@ def _loads(chain: Tree) -> tuple[Tensor, Tensor]:
     root = ElementTree.parse(URDF_FILE).getroot()
     masses, centres = [], []
     for name in chain.joint_names:
-        link = _value(root, f"joint[@name='{name}']/child", "link")
-        inertial = f"link[@name='{link}']/inertial"
-        masses.append(float(_value(root, f"{inertial}/mass", "value")))
-        centres.append([float(word) for word in _value(root, f"{inertial}/origin", "xyz").split()])
+        link = next(root.iterfind(f"joint[@name='{name}']/child")).attrib["link"]
+        inertial = next(root.iterfind(f"link[@name='{link}']/inertial"))
+        masses.append(float(next(inertial.iterfind("mass")).attrib["value"]))
+        centres.append([float(word) for word in next(inertial.iterfind("origin")).attrib["xyz"].split()])
     mass, centre = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in (masses, centres))
     return mass, centre
-
-
-def _held(chain: Tree) -> Tensor:
-    """Centre of mass of the payload (4,) in the frame of the last link [m]."""
-    return chain.tip_offsets[0] @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
-
-
-def _value(root: ElementTree.Element, path: str, attribute: str) -> str:
-    element = root.find(path)
-    if element is None:  # our own file: a broken installation
-        raise RobotError.of(f"'{URDF_FILE}' has no {path}", fix="install the package again")
-    return element.attrib[attribute]

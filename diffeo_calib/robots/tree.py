@@ -239,20 +239,15 @@ class Tree:
         Raises:
             InputError: wrong shape, or values that are not finite.
         """
-        return self.frames(q)[1]
+        tips = self.tip_poses(q)
+        return tips if len(self.tips) > 1 else tips[:, 0]
 
     def joint_frames(self, q: Tensor) -> Tensor:
         """Poses (N, n_all, 4, 4) of all moving joints' frames in the base: after ``O_l``, before the motion ``J_l``.
 
         The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
         """
-        return self.frames(q)[0]
-
-    def frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Joint frames (N, n_all, 4, 4), see :meth:`joint_frames`, and poses of the tip, see :meth:`__call__`."""
-        places = self.places(q)
-        tips = places[:, self.tip_places]
-        return places[:, : self.moving], tips if len(self.tips) > 1 else tips[:, 0]
+        return self.places(q)[:, : self.moving]
 
     def tip_poses(self, q: Tensor) -> Tensor:
         """Poses of all tips in the base, (N, tips, 4, 4) [m], also of a single one."""
@@ -273,14 +268,23 @@ class Tree:
         """
         q = self.joint_values(q)
         places, ends = self.places(q), self.tip_places
-        frames, moved = places[:, : self.moving], self.ancestors[ends].to(q.device)
-        axes = turned_axes(frames, self.axes)[:, None]  # (N, 1, n_all, 3)
-        arms = places[:, ends, None, :3, 3] - frames[:, None, :, :3, 3]  # (N, tips, n_all, 3)
-        turning = self.revolute.to(q.device)[:, None]
-        linear = torch.where(turning, torch.linalg.cross(axes.expand_as(arms), arms), axes)
-        angular = torch.where(turning, axes, 0.0).expand_as(arms)
-        found = self.by_active(torch.cat([linear, angular], dim=-1).mul(moved[..., None]).mT)
+        frames, moved = places[:, : self.moving], self.ancestors[ends]
+        turning = moved.to(q.device)[..., None] & self.revolute.to(q.device)[:, None]  # (tips, n_all, 1)
+        angular = self.by_active(torch.where(turning, turned_axes(frames, self.axes)[:, None], 0.0).mT)
+        found = torch.cat([self.point_slopes(frames, places[:, ends, :3, 3], moved), angular], dim=2)
         return found if len(self.tips) > 1 else found[:, 0]
+
+    def point_slopes(self, frames: Tensor, points: Tensor, moved: Tensor) -> Tensor:
+        """Derivatives of points by the active joints: (N, P, 3, n) [m/rad or m/m].
+
+        Args:
+            frames: (N, n_all, 4, 4) of the joints. points: (N, P, 3). moved: (P, n_all) whether a joint moves a point.
+        """
+        axes = turned_axes(frames, self.axes)[:, None]  # (N, 1, n_all, 3)
+        arms = points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, n_all, 3)
+        turning = self.revolute.to(axes.device)[:, None]
+        slopes = torch.where(turning, torch.linalg.cross(axes.expand_as(arms), arms), axes)
+        return self.by_active(slopes.mul(moved.to(axes.device)[..., None]).mT)
 
     def moving_values(self, q: Tensor) -> Tensor:
         """Values of all moving joints: q (N, n), checked by :meth:`joint_values` -> (N, n_all) [rad or m]."""

@@ -1,4 +1,4 @@
-"""NumPy arrays: their type, cross products, and the tableaus of Runge-Kutta methods by their names in model files."""
+"""NumPy arrays: their type, products, transforms, and the tableaus of Runge-Kutta methods by their names in files."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 def as_index(columns: Sequence[int]) -> slice | list[int]:
     """Columns as an index; consecutive ones as a slice, which makes no copy."""
     columns = list(columns)
-    consecutive = bool(columns) and columns == list(range(columns[0], columns[0] + len(columns)))
-    return slice(columns[0], columns[-1] + 1) if consecutive else columns
+    first = columns[0] if columns else 0
+    consecutive = columns == list(range(first, first + len(columns)))
+    return slice(first, first + len(columns)) if consecutive else columns
 
 
 def cross(a: Any, b: Any) -> Any:
@@ -25,6 +26,27 @@ def cross(a: Any, b: Any) -> Any:
 
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
+ONE = np.eye(3)
+_SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+"""w @ _SKEW is [w]x, row by row."""
+
+
+def skew(w: Array) -> Array:
+    """[w]x: (..., 3) -> (..., 3, 3)."""
+    return (w @ _SKEW).reshape(*w.shape, 3)
+
+
+def transforms(twists: Array) -> Array:
+    """T(t, w) = [[exp([w]x), t], [0, 1]]: (..., 6) -> (..., 4, 4)."""
+    w = twists[..., 3:]
+    x, W = (w * w).sum(-1)[..., None, None], skew(w)
+    a = np.sqrt(x)
+    out = np.zeros((*twists.shape[:-1], 4, 4))
+    out[..., :3, :3] = ONE + np.sinc(a / np.pi) * W + 0.5 * np.sinc(a / (2 * np.pi)) ** 2 * (W @ W)
+    out[..., :3, 3], out[..., 3, 3] = twists[..., :3], 1.0
+    return out
 
 
 Tableau = tuple[Array, Array]

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.runtime.arrays import Array, Tableau
-from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
+from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
+from diffeo_calib.runtime.chain import CalibratedChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
@@ -318,26 +318,32 @@ def recorded_flow(
         stages: (S, 2, C, n) controls and momenta at every stage.
         coefficients: (s, s), weights: (s,) of the Runge-Kutta method.
     """
-    terms = [term for term in (radial_term(config, stages) for config in kernel) if term.weights.any()]
-    alone = {config["output"] for config in kernel if config["output"] is not None}
-    small = stages.shape[2] <= MOST_TABULATED
-    own = {joint: [term for term in terms if small and term.acts_alone_on(joint)] for joint in sorted(alone)}
-    tables = {joint: tables for joint, found in own.items() if found and (tables := _joint_tables(found, joint))}
-    rest = [term for term in terms if not any(term in own[joint] for joint in tables)]
-    joints = tuple(tables)
-    per_stage = tuple(zip(*tables.values(), strict=True))
-    steps = len(stages) // len(weights)
-    together = JointTables(joints, per_stage) if tables else None
-    return RecordedFlow(stages.shape[-1], steps, coefficients, weights, tuple(rest), together)
+    rest: list[RadialTerm] = []
+    alone: dict[int, list[RadialTerm]] = {}
+    steps, n = len(stages) // len(weights), stages.shape[-1]
+    for config in kernel:
+        term, joint = radial_term(config, stages), config["output"]
+        if not term.weights.any():
+            continue
+        if joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED:
+            alone.setdefault(joint, []).append(term)
+        else:
+            rest.append(term)
+    tables = {joint: _joint_tables(terms, stages[:, 0, :, joint], joint) for joint, terms in sorted(alone.items())}
+    smooth = {joint: found for joint, found in tables.items() if found}
+    rest += [term for joint, terms in alone.items() if joint not in smooth for term in terms]
+    together = JointTables.of(list(smooth), list(zip(*smooth.values(), strict=True)), n) if smooth else None
+    steps = steps if rest or together else 0
+    return RecordedFlow(n, steps, coefficients / max(steps, 1), weights / max(steps, 1), tuple(rest), together)
 
 
-def _joint_tables(terms: Sequence[RadialTerm], joint: int) -> list[Table] | None:
-    """Tables of a joint's own function at every stage; None if it is too rough for them."""
+def _joint_tables(terms: Sequence[RadialTerm], controls: Array, joint: int) -> list[Table] | None:
+    """Tables of a joint's own function at every stage, for controls (S, C); None if it is too rough for them."""
     found = []
-    for controls, *weights in zip(terms[0].controls, *(term.weights for term in terms), strict=True):
+    for stage, angles in enumerate(controls):
         sums = [
-            PeriodicSum(term.profile, 1.0 / float(term.scales[0]), controls[:, joint], w[:, joint])
-            for term, w in zip(terms, weights, strict=True)
+            PeriodicSum(term.profile, 1.0 / float(term.scales[0]), angles, term.weights[stage, :, joint])
+            for term in terms
         ]
         table = tabulate(sums)
         if table is None:
@@ -346,26 +352,32 @@ def _joint_tables(terms: Sequence[RadialTerm], joint: int) -> list[Table] | None
     return found
 
 
+def _inputs(config: Mapping[str, Any], n: int) -> tuple[list[int], list[int]]:
+    """Columns that a kernel's term takes as lines and as circles."""
+    periodic, columns = config["periodic"], config["columns"]
+    columns = list(range(n)) if columns is None else columns
+    circles = [c for c in columns if (periodic if isinstance(periodic, bool) else periodic[c])]
+    return [c for c in columns if c not in circles], circles
+
+
 def radial_term(config: Mapping[str, Any], stages: Array) -> RadialTerm:
     """A kernel's term with its controls and weights; arguments as in :func:`recorded_flow`."""
-    n = stages.shape[-1]
-    periodic, columns = config["periodic"], config["columns"]
-    columns = range(n) if columns is None else columns
-    circle = [periodic if isinstance(periodic, bool) else periodic[c] for c in columns]
-    scales = np.broadcast_to(1.0 / np.array(config["lengthscale"], float), (len(circle),))
-    lines = [k for k, turning in enumerate(circle) if not turning]
-    circles = [k for k, turning in enumerate(circle) if turning]
+    n, columns = stages.shape[-1], config["columns"]
+    lines, circles = _inputs(config, n)
+    columns = list(range(n)) if columns is None else list(columns)
+    scales = np.broadcast_to(1.0 / np.array(config["lengthscale"], float), (len(columns),))
+    scales = scales[[columns.index(c) for c in (*lines, *circles)]]
     amplitude = np.broadcast_to(np.array(config["variance"], float), (n,))
     if config["output"] is not None:
         amplitude = amplitude * (np.arange(n) == config["output"])
-    return RadialTerm(
-        config["profile"],
-        tuple(columns[k] for k in lines),
-        tuple(columns[k] for k in circles),
-        scales[[*lines, *circles]],
-        np.ascontiguousarray(stages[:, 0]),
-        stages[:, 1] * amplitude,
-    )
+    L, x, angles = len(lines), stages[:, 0][..., lines], stages[:, 0][..., circles]
+    centre = x.mean(axis=(0, 1))
+    parts = (x - centre) * scales[:L], np.cos(angles) * scales[L:], np.sin(angles) * scales[L:]
+    F = np.concatenate(parts, axis=-1)  # (S, C, D)
+    right = np.concatenate([-2.0 * F, np.ones_like(F[..., :1]), (F * F).sum(-1, keepdims=True)], axis=-1)
+    right = np.ascontiguousarray(right.swapaxes(1, 2))
+    indices = as_index(lines), as_index(circles)
+    return RadialTerm(config["profile"], *indices, scales, centre, right, stages[:, 1] * amplitude)
 
 
 def recorded_stages(

@@ -12,11 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import factorial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array, cross
+from diffeo_calib.runtime.arrays import ONE, Array, cross, skew, transforms
+from diffeo_calib.runtime.flow import NUMPY, Operations
 
 SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
@@ -138,14 +139,7 @@ class CalibratedChain:
 
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
-        if self.waves is None:
-            return self._poses_and_jacobian(q)
-        tips, slopes = self._poses_and_jacobian(turned(self.waves, q))
-        return tips, slopes * self.waves.slopes(q)[:, None, None]
-
-    def _poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """The same for joint values that include their waves."""
-        motions, L = joint_motions(self, q), len(self.axes)
+        motions, L = joint_motions(self, q if self.waves is None else turned(self.waves, q)), len(self.axes)
         nominal = None if self.sag is None else nominal_frames(self.sag, motions)
         twists = self.twists[None] if nominal is None else error_twists(self, nominal)
         offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
@@ -161,36 +155,25 @@ class CalibratedChain:
         linear = np.where(self.revolute[:, None], cross(z, arms), z) * on_path
         angular = np.where(self.revolute[:, None], z, 0.0) * on_path
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
-        if nominal is None or self.sag is None:
-            return tips, by_moving @ self.coupling
-        amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
-        slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
-        shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
-        turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
-        moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
-        sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
-        return tips, (by_moving + np.concatenate(sums, axis=2)) @ self.coupling
+        if self.sag is not None:
+            amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
+            slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
+            shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
+            turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
+            moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
+            sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
+            by_moving = by_moving + np.concatenate(sums, axis=2)
+        found = by_moving @ self.coupling
+        return tips, found if self.waves is None else found * self.waves.slopes(q)[:, None, None]
 
 
-class Operations(NamedTuple):
-    """Functions of an array library for poses: NumPy's here, torch's in interop/torch_modules.py."""
-
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
-    stack: Callable[[Any, int], Any]
-    broadcast_to: Callable[[Any, Any], Any]
-    transforms: Callable[[Any], Any]
-    inverse: Callable[[Any], Any]
-
-
-def tip_poses(chain: Any, q: Any, use: Operations | None = None) -> Any:
+def tip_poses(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
     """Poses of the tips: (N, n) -> (N, T, 4, 4) [m].
 
     Args:
         chain: the constants of a :class:`CalibratedChain`, as arrays of the library. q: joint values.
         use: the library; NumPy by default.
     """
-    use = NUMPY if use is None else use
     motions = joint_motions(chain, q if chain.waves is None else turned(chain.waves, q, use), use)
     offsets = chain.offsets
     if chain.sag is not None:
@@ -198,20 +181,14 @@ def tip_poses(chain: Any, q: Any, use: Operations | None = None) -> Any:
     return ends(chain, link_frames(chain, offsets @ motions), use)
 
 
-def turned(waves: Any, x: Any, use: Operations | None = None) -> Any:
+def turned(waves: Any, x: Any, use: Operations = NUMPY) -> Any:
     """Joint values with their waves: (N, n) -> (N, n)."""
-    use = NUMPY if use is None else use
-    angles, cosine, sine = (
-        x[:, list(waves.joints)] * waves.frequencies,
-        waves.coefficients[:, 0],
-        waves.coefficients[:, 1],
-    )
+    angles, (cosine, sine) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
     return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
 
 
-def joint_motions(chain: Any, q: Any, use: Operations | None = None) -> Any:
+def joint_motions(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
     """J_l: (N, n_all, 4, 4)."""
-    use = NUMPY if use is None else use
     x = (q @ chain.coupling.T + chain.coupling_offset)[..., None, None]
     C, S, D, L = chain.motions
     motions = C + S * use.sin(x) + D * use.cos(x)
@@ -226,15 +203,15 @@ def link_frames(chain: Any, steps: Any) -> list[Any]:
     return links
 
 
-def ends(chain: Any, links: Sequence[Any], use: Operations | None = None) -> Any:
+def ends(chain: Any, links: Sequence[Any], use: Operations = NUMPY) -> Any:
     """Poses of the tips on their links: (N, T, 4, 4)."""
-    use, L = NUMPY if use is None else use, len(links) - 1
+    L = len(links) - 1
     return use.stack([links[number + 1] for number in chain.before[L : L + len(chain.tips)]], 1) @ chain.tips
 
 
-def nominal_frames(sag: Any, motions: Any, use: Operations | None = None) -> Any:
+def nominal_frames(sag: Any, motions: Any, use: Operations = NUMPY) -> Any:
     """Nominal frames of all places on the ground: (N, F, 4, 4)."""
-    use, poses = NUMPY if use is None else use, []
+    poses: list[Any] = []
     for place, before in enumerate(sag.before):
         offset = sag.offsets[place]
         on_base = use.broadcast_to(offset, motions[:, 0].shape)
@@ -272,22 +249,11 @@ def load_slopes(axes: Any, revolute: Any, sag: Any, nominal: Any) -> Any:
     return (e[:, :, None] @ slopes_m)[:, :, 0] + (slopes_e @ m[..., None])[..., 0]
 
 
-def transforms(twists: Array) -> Array:
-    """T(t, w) of the module's docstring: (..., 6) -> (..., 4, 4)."""
-    w = twists[..., 3:]
-    x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    a = np.sqrt(x)
-    out = np.zeros((*twists.shape[:-1], 4, 4))
-    out[..., :3, :3] = _ONE + np.sinc(a / np.pi) * W + 0.5 * np.sinc(a / (2 * np.pi)) ** 2 * (W @ W)
-    out[..., :3, 3], out[..., 3, 3] = twists[..., :3], 1.0
-    return out
-
-
 def _right_jacobian(w: Array) -> Array:
     """Jr of SO(3): (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
     return (
-        _ONE
+        ONE
         - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W
         + smooth(x, 3, lambda a: (a - np.sin(a)) / a**3, np.where) * (W @ W)
     )
@@ -304,14 +270,3 @@ def smooth(x: Any, order: int, closed: Callable[[Any], Any], where: Callable[...
     for k in reversed(range(SERIES_TERMS)):  # Horner; torch subtracts a tensor from a number several times slower
         series = minus * series + 1.0 / factorial(2 * k + order)
     return where(small, series, closed(far**0.5))
-
-
-def skew(w: Array) -> Array:
-    """[w]x: (..., 3) -> (..., 3, 3)."""
-    return (w @ _SKEW).reshape(*w.shape, 3)
-
-
-_ONE = np.eye(3)
-_SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
-"""w @ _SKEW is [w]x, row by row."""
-NUMPY = Operations(np.sin, np.cos, np.stack, np.broadcast_to, transforms, np.linalg.inv)

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,42 +28,43 @@ from diffeo_calib.runtime.arrays import Array, as_index
 SMALLEST_RADIUS = 1e-7
 """Floor under r where a formula divides by it."""
 
-Profile = Callable[..., tuple[Array, ...]]
-"""``profile(r2)`` is (kappa,); ``profile(r2, slopes=True)`` is kappa with its first two derivatives in r2."""
 
-
-def gaussian(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
+def gaussian(r2: Array) -> Iterator[Array]:
     """exp(-r2 / 2)."""
-    kappa = np.exp(-0.5 * r2)
-    return (kappa, -0.5 * kappa, 0.25 * kappa) if slopes else (kappa,)
+    kappa = r2 * -0.5
+    np.exp(kappa, out=kappa)
+    yield kappa
+    yield -0.5 * kappa
+    yield 0.25 * kappa
 
 
-def cauchy(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
+def cauchy(r2: Array) -> Iterator[Array]:
     """1 / (1 + r2)."""
     kappa = 1.0 / (1.0 + r2)
-    return (kappa, -(kappa**2), 2.0 * kappa**3) if slopes else (kappa,)
+    yield kappa
+    yield -(kappa**2)
+    yield 2.0 * kappa**3
 
 
-def constant(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
+def constant(r2: Array) -> Iterator[Array]:
     """1: the same motion everywhere."""
-    return (np.ones_like(r2), np.zeros_like(r2), np.zeros_like(r2)) if slopes else (np.ones_like(r2),)
+    yield np.ones_like(r2)
+    yield np.zeros_like(r2)
+    yield np.zeros_like(r2)
 
 
-def matern(r2: Array, *, order: int, slopes: bool = False) -> tuple[Array, ...]:
+def matern(r2: Array, *, order: int) -> Iterator[Array]:
     """p_k(r) exp(-r) with r = sqrt(2 nu r2), nu = k + 1/2, for the orders k = 1, 2, 3.
 
     d kappa_k / d r2 = -c / (2 (2 k - 1)) kappa_(k-1) at fixed c = 2 nu, with kappa_0 = exp(-r) and
     d kappa_0 / d r2 = -c / (2 r) exp(-r).
     """
-    c = 2.0 * order + 1.0
+    c, factor = 2.0 * order + 1.0, 1.0
     r = np.sqrt(np.maximum(r2, 0.0) * c)
     decay = np.exp(-r)
-    kappa = _polynomial(r, order) * decay
-    if not slopes:
-        return (kappa,)
-    first = -0.5 * c / (2 * order - 1)
-    second = first * -0.5 * c / max(2 * order - 3, 1)
-    return kappa, first * _polynomial(r, order - 1) * decay, second * _polynomial(r, order - 2) * decay
+    for k in range(3):
+        yield factor * _polynomial(r, order - k) * decay
+        factor *= -0.5 * c / max(2 * (order - k) - 1, 1)
 
 
 def _polynomial(r: Array, order: int) -> Array:
@@ -76,7 +78,7 @@ def _polynomial(r: Array, order: int) -> Array:
     return np.ones_like(r) if order == 0 else 1.0 / np.maximum(r, SMALLEST_RADIUS)
 
 
-PROFILES: dict[str, Profile] = {
+PROFILES: dict[str, Callable[[Array], Iterator[Array]]] = {
     "gaussian": gaussian,
     "cauchy": cauchy,
     "constant": constant,
@@ -84,7 +86,7 @@ PROFILES: dict[str, Profile] = {
     "matern52": partial(matern, order=2),
     "matern72": partial(matern, order=3),
 }
-"""All profiles by their names in model files."""
+"""All profiles by their names in model files: kappa at r2, and on request its first two derivatives in r2."""
 
 
 TOLERANCE = 1e-13
@@ -118,45 +120,18 @@ class PeriodicSum:
         """Where a derivative of low order jumps, in [0, 2 pi)."""
         return np.mod(self.angles, TURN) if self.profile.startswith("matern") else np.zeros(0)
 
-    def values(self, x: Array) -> Array:
-        """f (K,) in rad at x (K,)."""
-        parts = [np.zeros(0)]
-        for rows in self._blocks(len(x)):
-            along = self._around(x[rows]) @ self._circle  # cos(x - q)
-            parts.append(PROFILES[self.profile](self._scale * (1.0 - along))[0] @ self.weights)
-        return np.concatenate(parts)
-
     def derivatives(self, x: Array) -> Array:
         """f, f', f'' in rad, 1, 1/rad: (K, 3) at x (K,)."""
-        parts = [np.zeros((0, 3))]
-        for rows in self._blocks(len(x)):
-            around = self._around(x[rows])
-            along, across = around @ self._circle, around @ self._quarter  # cos, sin of x - q
-            kappa, slope, curvature = PROFILES[self.profile](self._scale * (1.0 - along), slopes=True)
-            first, second = self._scale * across, self._scale * along  # derivatives of the squared distance
+        cosine, sine, scale = np.cos(self.angles), np.sin(self.angles), 2.0 / self.lengthscale**2
+        out, size = np.empty((len(x), 3)), max(BLOCK // len(self.angles), 1)
+        for rows in (slice(first, first + size) for first in range(0, len(x), size)):
+            around = np.stack([np.cos(x[rows]), np.sin(x[rows])], axis=1)
+            along, across = around @ np.stack([cosine, sine]), around @ np.stack([-sine, cosine])  # cos, sin of x - q
+            kappa, slope, curvature = PROFILES[self.profile](scale * (1.0 - along))
+            first, second = scale * across, scale * along  # derivatives of the squared distance
             sums = (kappa, slope * first, curvature * first**2 + slope * second)
-            parts.append(np.stack([s @ self.weights for s in sums], axis=1))
-        return np.concatenate(parts)
-
-    def _blocks(self, count: int) -> Iterator[slice]:
-        size = max(BLOCK // max(len(self.angles), 1), 1)
-        return (slice(first, first + size) for first in range(0, count, size))
-
-    @staticmethod
-    def _around(x: Array) -> Array:
-        return np.stack([np.cos(x), np.sin(x)], axis=1)
-
-    @cached_property
-    def _scale(self) -> float:
-        return 2.0 / self.lengthscale**2
-
-    @cached_property
-    def _circle(self) -> Array:
-        return np.stack([np.cos(self.angles), np.sin(self.angles)])
-
-    @cached_property
-    def _quarter(self) -> Array:
-        return np.stack([-np.sin(self.angles), np.cos(self.angles)])
+            out[rows] = np.stack([s @ self.weights for s in sums], axis=1)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,50 +161,62 @@ class JointTables:
     """Functions of single joints at every stage.
 
     Args:
-        joints: numbers of the L joints, ascending.
+        joints: numbers of the L joints, ascending, as an index.
         stages: for every stage a table per joint.
+        selection: (L, n) units of these joints.
+        shifts: (L,) of the circles of the joints, which lie side by side on a line.
+        starts: (S, power of 2) first knots of the cells of a stage on this line, ascending; of each circle's first cell
+            a place before it. cells: (S, 7, K) first knot, and coefficients of (x - knot)^0 ... (x - knot)^5.
     """
 
-    joints: tuple[int, ...]
+    joints: slice | list[int]
     stages: tuple[tuple[Table, ...], ...]
+    selection: Array
+    shifts: Array
+    starts: Array
+    cells: Array
 
-    def values(self, stage: int, x: Array) -> Array:
-        """f of every joint: x (N, n) -> (N, L)."""
-        return _quintic(*self._cells(stage, x))
+    @classmethod
+    def of(cls, joints: Sequence[int], stages: Sequence[Sequence[Table]], size: int) -> JointTables:
+        """Tables of these joints of n at every stage."""
+        shifts = CIRCLE_SPACING_RAD * np.arange(len(joints), dtype=np.float64)
+        most = max(sum(len(table.knots) - 1 for table in tables) for tables in stages)
+        starts = np.full((len(stages), 1 << most.bit_length()), CIRCLE_SPACING_RAD * (len(joints) + 1))
+        cells = np.zeros((len(stages), 7, most))
+        for stage, tables in enumerate(stages):
+            knots = np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, shifts, strict=True)])
+            found = np.vstack([knots, np.concatenate([t.coefficients for t in tables], axis=1)])
+            first = np.isin(knots, shifts)
+            starts[stage, : len(knots)], cells[stage, :, : len(knots)] = knots - 1.0 * first, found
+        return cls(as_index(joints), tuple(map(tuple, stages)), np.eye(size)[list(joints)], shifts, starts, cells)
 
-    def derivatives(self, stage: int, x: Array) -> tuple[Array, Array]:
-        """f and the derivative of the interpolated f, of every joint: x (N, n) -> (N, L) each."""
-        c, u = self._cells(stage, x)
-        return _quintic(c, u), (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
-
-    def _cells(self, stage: int, x: Array) -> tuple[Array, Array]:
-        """Coefficients (6, N, L) of the polynomials around x, and the places (N, L) from their knots."""
-        starts, coefficients = self._lines[stage]
-        t = np.mod(x[:, self._columns], TURN) + self._shifts
-        index = np.searchsorted(starts, t, side="right") - 1
-        return coefficients[:, index], t - starts[index]
-
-    @cached_property
-    def _columns(self) -> slice | list[int]:
-        return as_index(self.joints)
-
-    @cached_property
-    def _shifts(self) -> Array:
-        return CIRCLE_SPACING_RAD * np.arange(len(self.joints), dtype=np.float64)
-
-    @cached_property
-    def _lines(self) -> list[tuple[Array, Array]]:
-        """For every stage the cells of all joints on one line: their first knots (K,) and coefficients (6, K)."""
-        return [
-            (
-                np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, self._shifts, strict=True)]),
-                np.concatenate([t.coefficients for t in tables], axis=1),
-            )
-            for tables in self.stages
-        ]
+    def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
+        """f of every joint in its component (N, n), and the derivative of the interpolated f, (N, n, n)."""
+        value, u, c = tabulated(self, stage, x, np.floor, cells_around)
+        slope = (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
+        return value @ self.selection, (slope @ self.selection)[..., None] * np.eye(x.shape[1])
 
 
-def _quintic(c: Array, u: Array) -> Array:
+def tabulated(
+    tables: Any, stage: int, x: Any, floor: Callable[[Any], Any], around: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any, list[Any]]:
+    """f of every joint (N, L) at x (N, n), the distances (N, L) from the knots, and the coefficients there.
+
+    Args:
+        tables: the constants of :class:`JointTables`, as arrays of a library. floor: of it. around: as cells_around.
+    """
+    angle = x[..., tables.joints]
+    t = angle - TURN * floor(angle * (1.0 / TURN)) + tables.shifts
+    start, *c = around(tables.starts[stage], tables.cells[stage], t)
+    return _quintic(c, t - start), t - start, c
+
+
+def cells_around(starts: Array, cells: Array, t: Array) -> Array:
+    """The columns of cells (7, K) that begin at the last starts before t: seven arrays."""
+    return cells[:, np.searchsorted(starts, t, side="right") - 1]
+
+
+def _quintic(c: Any, u: Any) -> Any:
     return ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
 
 
@@ -244,7 +231,7 @@ def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
     while open_cells.any():
         middles = 0.5 * (knots[:-1] + knots[1:])[open_cells]
         c, u = Table(knots, values).coefficients[:, open_cells], middles - knots[:-1][open_cells]
-        wrong = np.abs(_quintic(c, u) - sum(s.values(middles) for s in sums)) > limit
+        wrong = np.abs(_quintic(c, u) - _derivatives(sums, middles)[:, 0]) > limit
         if len(knots) + int(wrong.sum()) > MOST_CELLS:
             return None
         cells = np.flatnonzero(open_cells)[wrong]

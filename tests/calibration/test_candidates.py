@@ -75,7 +75,7 @@ def test_the_device_sees_the_marker(robot: Chain) -> None:
 def test_links_and_tool_stay_above_the_floor_and_outside_the_column(robot: Chain) -> None:
     tool, tracker = torch.tensor([0.0, 0.0, 0.2, 1.0], dtype=torch.float64), dc.Tracker((9.0, 0.0, 0.0), (0, 0, 0.2))
     q = dc.candidates(robot, 300, tracker=tracker, floor=0.1, column=(0.4, 0.0, 0.15))
-    frames, tip = robot.frames(q)
+    frames, tip = robot.joint_frames(q), robot(q)
     ends = torch.cat([frames[:, 1:, :3, 3], tip[:, None, :3, 3], (tip @ tool)[:, None, :3]], 1)
     assert float(ends[..., 2].min()) >= 0.1
     for row in ends:

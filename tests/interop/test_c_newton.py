@@ -13,7 +13,7 @@ from deformation_bank import deformation_of
 from robots_bank import CHAINS, draw
 from scipy.spatial.transform import Rotation
 
-from diffeo_calib.interop.c_source import Settings, c_source
+from diffeo_calib.interop.c_source import c_source
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.robots import Chain
 from diffeo_calib.robots.se3 import twist_transform
@@ -27,8 +27,9 @@ LIMIT = 1.2
 def stepper(chain: Chain, folder: Path, limits: np.ndarray) -> CModel:
     program = program_of(deformation_of(chain, elastic=False))
     assert program is not None
-    settings = Settings(TOOL, np.eye(4), limits, "robot", [], "the measuring frame")
-    for suffix, text in zip((".c", ".h"), c_source(program, settings, "step", "step"), strict=True):
+    settings = {"tool": TOOL, "frame": np.eye(4), "limits": limits}
+    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
+    for suffix, text in zip((".c", ".h"), c_source(program, "step", "step", **settings, **texts), strict=True):
         (folder / f"step{suffix}").write_text(text)
     return CModel(folder / "step.c", chain.n, len(program.markers))
 

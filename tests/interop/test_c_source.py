@@ -16,7 +16,7 @@ from robots_bank import CHAINS, draw
 
 import diffeo_calib as dc
 from diffeo_calib.interop import write_c
-from diffeo_calib.interop.c_source import Settings, c_source
+from diffeo_calib.interop.c_source import c_source
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of
@@ -43,8 +43,9 @@ def c_model(deformation: GeodesicDeformation, folder: Path, tip: str | None = No
     assert program is not None
     program = program if tip is None else program.at(tip)
     n = program.chain.n
-    settings = Settings(TOOL, np.eye(4), np.tile([-np.inf, np.inf], (n, 1)), "robot", [], "the measuring frame")
-    for suffix, text in zip((".c", ".h"), c_source(program, settings, "generated", "robot"), strict=True):
+    settings = {"tool": TOOL, "frame": np.eye(4), "limits": np.tile([-np.inf, np.inf], (n, 1))}
+    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
+    for suffix, text in zip((".c", ".h"), c_source(program, "generated", "robot", **settings, **texts), strict=True):
         (folder / f"generated{suffix}").write_text(text)
     return CModel(folder / "generated.c", n, len(program.markers), "robot")
 

@@ -81,11 +81,9 @@ def random_poses(rows: int, seed: int) -> Array:
 
 def targets(kind: str, rows: int) -> Targets:
     poses = random_poses(rows, 3)[:, None]
-    if kind == "poses":
-        return Targets(poses[..., :3, 3], rotation=poses[..., :3, :3], lever=0.3)
-    if kind == "axis":
-        return Targets(poses[..., :3, 3], axis=poses[..., :3, 1], tool_axis=np.array([0.0, 0.0, 1.0]), lever=0.3)
-    return Targets(poses[..., :3, 3])
+    count = {"poses": 3, "axis": 1, "positions": 0}[kind]
+    tool_axes = np.eye(3)[:, -count:] if count else np.zeros((3, 0))
+    return Targets(poses[..., :3, 3], poses[..., :3, :count], tool_axes, lever=0.3)
 
 
 @pytest.mark.parametrize("kind", ["poses", "axis", "positions"])
@@ -102,10 +100,10 @@ def test_gradient_and_hessian_of_the_cost(kind: str, name: str) -> None:
 
     def slope(at: Array) -> Array:
         poses, J = chain.poses_and_jacobian(at)
-        return -np.einsum("nkj,nk->nj", goal.slopes(J, poses), goal.errors(poses))
+        return -np.einsum("nkj,nk->nj", goal.slopes(J), goal.errors(poses))
 
     poses, J = chain.poses_and_jacobian(q)
-    S = goal.slopes(J, poses)
+    S = goal.slopes(J)
     hessian = S.swapaxes(1, 2) @ S + goal.curvature(J, poses)
     for joint in range(n):
         step = np.zeros(n)
@@ -119,9 +117,8 @@ def test_misses_are_distances_and_angles() -> None:
     goal, poses = targets("poses", 5), random_poses(5, 4)[:, None]
     distance, angle = goal.misses(poses)
     assert angle is not None
-    assert goal.rotation is not None
     np.testing.assert_allclose(distance, np.linalg.norm(poses[..., :3, 3] - goal.position, axis=2), atol=1e-14)
-    traces = np.trace(poses[..., :3, :3] @ goal.rotation.swapaxes(2, 3), axis1=2, axis2=3)
+    traces = np.trace(poses[..., :3, :3] @ goal.axes.swapaxes(2, 3), axis1=2, axis2=3)
     np.testing.assert_allclose(angle, np.arccos((traces - 1) / 2), atol=1e-10)
 
 

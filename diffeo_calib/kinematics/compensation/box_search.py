@@ -108,7 +108,7 @@ class _Search:
             return
         targets, poses, pull, box = self.targets.take(rows), self.poses[rows], self.pull[rows], self.box.take(rows)
         jacobian, q = self.tool.jacobian(self.q[rows]), self.q[rows]
-        slopes = targets.slopes(jacobian, poses)
+        slopes = targets.slopes(jacobian)
         slope = pull * (q - box.start) - (slopes.swapaxes(1, 2) @ targets.errors(poses)[:, :, None])[:, :, 0]
         hessian = slopes.swapaxes(1, 2) @ slopes + pull[:, :, None] * np.eye(pull.shape[1])
         if self.tool.serial:
@@ -141,7 +141,7 @@ def _finished(tool: ToolFunctions, targets: Targets, q: Array, box: Box, poses: 
     if len(rows):
         inside, goal = box.take(rows), targets.take(rows)
         free = (q[rows] > inside.low) & (q[rows] < inside.high)
-        slopes = goal.slopes(tool.jacobian(q[rows]), poses[rows])
+        slopes = goal.slopes(tool.jacobian(q[rows]))
         room = Box(inside.start, inside.low, inside.high, inside.mobility * free)
         moved, seen, there = chord_search(tool, goal, q[rows], room, slopes=slopes, poses=poses[rows])
         rows, moved, seen = rows[there], moved[there], seen[there]
@@ -268,20 +268,11 @@ def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
         InputError: not a positive number, or one for each joint.
     """
     usual = scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
-    return usual if bound is None else _by_joint(chain, bound, "bound", usual)
+    return usual if bound is None else by_joint(chain, bound, "bound", usual)
 
 
-def rates(chain: Tree, rate: object, usual: Array) -> Array:
-    """(n,) how fast a correction may change; ``usual`` (n,) is taken for prismatic joints if one number is given.
-
-    Raises:
-        InputError: not a positive number, or one for each joint.
-    """
-    return _by_joint(chain, rate, "rate", usual)
-
-
-def _by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
-    """One number for all turning joints, or one for each joint."""
+def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
+    """A positive number for all turning joints, ``usual`` (n,) for the others, or one number for each joint: (n,)."""
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
     return positive(value, name, (chain.n,)).numpy().copy()

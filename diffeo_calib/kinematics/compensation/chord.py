@@ -71,9 +71,9 @@ def chord_search(
     q, poses = q.copy(), poses.copy()
     done = reached(targets, poses)
     todo = np.flatnonzero(~done)
-    inverse = _right_inverse(targets.take(todo).independent(slopes[todo]), box.mobility[todo])
+    inverse = _right_inverse(slopes[todo], box.mobility[todo])
     goal, room = targets.take(todo), box.take(todo)
-    error = goal.independent(goal.errors(poses[todo]))
+    error = goal.errors(poses[todo])
     for _ in range(MOST_STEPS):
         if not len(todo):
             break
@@ -85,7 +85,7 @@ def chord_search(
             break
         at = q[todo] + step
         seen = tool.poses(at)
-        fresh = goal.independent(goal.errors(seen))
+        fresh = goal.errors(seen)
         arrived = reached(goal, seen)
         good = arrived | (np.linalg.norm(fresh, axis=1) < SLOWEST_CONTRACTION * np.linalg.norm(error, axis=1))
         q[todo[good]], poses[todo[good]], done[todo[arrived]] = at[good], seen[good], True

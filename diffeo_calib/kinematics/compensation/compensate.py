@@ -28,10 +28,16 @@ from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.compensation.box_search import box_search, joint_limits, largest_motion, mobilities, rates
+from diffeo_calib.kinematics.compensation.box_search import (
+    box_search,
+    by_joint,
+    joint_limits,
+    largest_motion,
+    mobilities,
+)
 from diffeo_calib.kinematics.compensation.chord import Box, reached
 from diffeo_calib.kinematics.compensation.kinematics import tool_functions
-from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Room, Solution, Status
+from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Solution, Status
 from diffeo_calib.kinematics.compensation.targets import (
     Array,
     Targets,
@@ -174,15 +180,20 @@ def compensate(
     exact, rough = tool_functions(model, tools, frame)
     motion = largest_motion(robot, bound, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
-    room = Room(begin, joint_limits(robot, limits), motion, mobilities(robot, weights, tuple(tools), aimed))
-    problem = CompensationProblem(exact, rough, goals, room)
-    pace = _pace(robot, room, rate, time, path=path and not following)
+    mobility = mobilities(robot, weights, tuple(tools), aimed)
+    problem = CompensationProblem(exact, rough, goals, begin, joint_limits(robot, limits), motion, mobility)
+    pace = _pace(robot, problem, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))
     if pace is None:
         return _result(problem, problem.solve())
     found, jumps = solve_path(problem, pace)
-    _warn_of_jumps(jumps)
+    if len(jumps):
+        rows = (
+            f"the corrections of the path jump after {few(jumps.tolist())} rows, and were spread over the rows around"
+        )
+        fix = "look at their statuses: the path may pass a singularity or change its branch there"
+        warn_user(sentence(rows, fix=fix))
     return _result(problem, found, jumps)
 
 
@@ -197,7 +208,7 @@ def _starts(start: object, robot: Tree, targets: Tensor) -> tuple[Array, bool]:
     return finite_rows(start, "start", ("N", robot.n), fix), False
 
 
-def _pace(robot: Tree, room: Room, rate: object, time: object, *, path: bool) -> Pace | None:
+def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object, *, path: bool) -> Pace | None:
     """How fast corrections may change; None for rows on their own.
 
     Raises:
@@ -208,23 +219,14 @@ def _pace(robot: Tree, room: Room, rate: object, time: object, *, path: bool) ->
             what = "`rate` and `time` limit how fast the corrections of a path change"
             raise InputError.of(what, fix="pass path=True and a start for every row, or leave them out")
         return None
-    count = len(room.start)
+    count = len(problem.start)
     times = np.arange(count, dtype=np.float64) if time is None else finite_rows(time, "time", (count,), "pass seconds")
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         got = f"{times[late[0] + 1]:g} after {times[late[0]]:g}"
         raise InputError.of(f"`time`, row {late[0] + 1}", expected="increasing times", got=got, fix="sort the rows")
-    slowest = room.bound * (ROWS_PER_BOUND if time is None else 1.0)
-    return Pace(times, slowest if rate is None else rates(robot, rate, slowest))
-
-
-def _warn_of_jumps(jumps: Array) -> None:
-    if len(jumps):
-        fix = "look at their statuses: the path may pass a singularity or change its branch there"
-        what = (
-            f"the corrections of the path jump after {few(jumps.tolist())} rows, and were spread over the rows around"
-        )
-        warn_user(sentence(what, fix=fix))
+    slowest = problem.bound * (ROWS_PER_BOUND if time is None else 1.0)
+    return Pace(times, slowest if rate is None else by_joint(robot, rate, "rate", slowest))
 
 
 def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[str, Tensor]:
@@ -253,7 +255,7 @@ def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] 
     else:
         miss, angle = np.where(free, np.nan, miss), None if angle is None else np.where(free, np.nan, angle)
     status = tuple(MEMBERS[code] for code in found.codes.tolist())
-    q, start, seen, away = (torch.from_numpy(part) for part in (found.q, problem.room.start.copy(), poses, miss))
+    q, start, seen, away = (torch.from_numpy(part) for part in (found.q, problem.start.copy(), poses, miss))
     turned = None if angle is None else torch.from_numpy(angle)
     return Compensation(q, start, status, seen, away, turned, tuple(int(row) for row in jumps))
 
@@ -306,7 +308,7 @@ def _lowest(values: Array, steps: Array) -> Array:
 def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Array]:
     """Commands of a path, and the rows at which the corrections of the rows on their own jump."""
     found = problem.solve()
-    start = problem.room.start
+    start = problem.start
     jumps = pace.jumps(found.q - start)
     firm = found.codes == CODE[Status.reached]
     q, held = found.q.copy(), np.zeros(found.q.shape, dtype=bool)
@@ -319,13 +321,13 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
         q[rows] = _with_held_joints(problem.take(rows), slow[rows], held[rows])
     slow = start + pace.limited(q - start, firm)
     q = np.where(np.abs(slow - q) > ROUNDING, slow, q)
-    box = problem.room.box(np.arange(len(q)))
+    box = problem.box()
     return problem.keep_mimics(_judged(problem, found, np.clip(q, box.low, box.high))), jumps
 
 
 def _with_held_joints(problem: CompensationProblem, q: Array, held: Array) -> Array:
     """The nearest commands (R, n) with some joints held (R, n)."""
-    box = problem.room.box(np.arange(len(q)))
+    box = problem.box()
     q = np.clip(q, box.low, box.high)
     box = Box(box.start, np.where(held, q, box.low), np.where(held, q, box.high), box.mobility * ~held)
     return box_search(problem.tool, problem.targets, q, box)[0]

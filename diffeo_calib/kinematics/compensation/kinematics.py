@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from math import isfinite
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array
 from diffeo_calib.kinematics.tool import ToolKinematics
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.build import calibrated_chain
 
 SOME_LENGTH = 0.5
@@ -58,33 +60,27 @@ def tool_functions(
     if key not in known:
         if len(known) >= MOST_TOOLS:
             known.clear()
-        robot = model.robot
-        alike = robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
-        exact, rough = _calibrated(model, tools, frame), _rough(model, tools, frame)
-        known[key] = ToolFunctions(*exact, *alike), ToolFunctions(*rough, *alike)
+        known[key] = _calibrated(model, tools, frame), _rough(model, tools, frame)
     return known[key]
 
 
-Functions = tuple[Callable[[Array], Array], Callable[[Array], Array]]
+def _shape(robot: Tree) -> tuple[bool, float]:
+    return robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
 
 
-def _calibrated(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> Functions:
-    """Poses and Jacobians of the calibrated kinematics."""
+def _calibrated(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
     device = model.configurations.device
     each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
-    def poses(q: Array) -> Array:
+    def by_tool(of: Callable[[ToolKinematics, Tensor], Tensor], q: Array) -> Array:
         at = torch.from_numpy(q).to(device)
-        return torch.stack([tool.poses(at) for tool in each], 1).cpu().numpy()
+        return torch.stack([of(tool, at) for tool in each], 1).detach().cpu().numpy()
 
-    def jacobian(q: Array) -> Array:
-        at = torch.from_numpy(q).to(device)
-        return torch.stack([tool.jacobian(at) for tool in each], 1).detach().cpu().numpy()
-
-    return poses, jacobian
+    poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
+    return ToolFunctions(poses, jacobian, *_shape(model.robot))
 
 
-def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> Functions:
+def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
     """Those of the geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
     geometry, robot = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
@@ -93,4 +89,6 @@ def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str)
     numbers, ends = [robot.tips.index(tip) for tip in tools], chain.tips.copy()
     ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
     chain = replace(chain, tips=ends)
-    return lambda q: chain.poses(q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers]
+    return ToolFunctions(
+        lambda q: chain.poses(q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers], *_shape(robot)
+    )

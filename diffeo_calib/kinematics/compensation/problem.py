@@ -33,45 +33,58 @@ class CompensationProblem:
 
     Args:
         tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets. room: the boxes.
+        targets: N targets.
+        start: (N, n) rad or m. limits: of the joints, and of mimic joints.
+        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
     """
 
     tool: ToolFunctions
     rough: ToolFunctions
     targets: Targets
-    room: Room
+    start: Array
+    limits: Limits
+    bound: Array
+    mobility: Array
 
     def take(self, rows: Array) -> CompensationProblem:
         """Some of the rows."""
-        return self.started(rows, self.room.start[rows])
+        return self.started(rows, self.start[rows])
 
     def started(self, rows: Array, start: Array) -> CompensationProblem:
         """Some of the rows (R,) from other starts (R, n)."""
-        return replace(self, targets=self.targets.take(rows), room=self.room.started(rows, start))
+        return replace(self, targets=self.targets.take(rows), start=start, mobility=self.mobility[rows])
+
+    def box(self, rows: Array | slice = slice(None), *, limited: bool = True, scale: float = 1.0) -> Box:
+        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
+        start = self.start[rows]
+        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
+        low, high = start - motion, start + motion
+        if limited:
+            low, high = np.maximum(low, self.limits.low), np.minimum(high, self.limits.high)
+        return Box(start, low, high, self.mobility[rows])
 
     def solve(self) -> Solution:
-        """The nearest command of every row on its own."""
-        count, n = self.room.start.shape
-        found = Solution(np.full((count, n), np.nan), self._no_poses(count), np.empty(count, dtype=int))
-        for first in range(0, count, ROWS_AT_ONCE):
-            rows = np.arange(first, min(first + ROWS_AT_ONCE, count))
+        """The nearest command of every row on its own; none where a start is farther beyond a limit than the bound."""
+        count, n = self.start.shape
+        poses = np.full((count, self.targets.tools, 4, 4), np.nan)
+        found = Solution(np.full((count, n), np.nan), poses, np.full(count, CODE[Status.limit]))
+        box = self.box()
+        possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
+        for first in range(0, len(possible), ROWS_AT_ONCE):
+            rows = possible[first : first + ROWS_AT_ONCE]
             for whole, part in zip(found, self.take(rows)._solve(), strict=True):
                 whole[rows] = part
         return found
 
     def _solve(self) -> Solution:
-        rows = np.arange(len(self.targets))
-        box = self.room.box(rows)
-        nowhere = np.any(box.low > box.high, axis=1)
-        if nowhere.any():
-            return self._without(nowhere)
+        box = self.box()
         q, poses, done = self.search(box, np.clip(box.start, box.low, box.high))
         return self.keep_mimics(Solution(q, poses, self._codes(q, poses, done)))
 
     def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:
         """The fast search from ``q`` (N, n), and the careful one for the rows that it gives up."""
         poses = self.tool.poses(q)
-        slopes = self.targets.slopes(self.rough.jacobian(q), poses)
+        slopes = self.targets.slopes(self.rough.jacobian(q))
         found, seen, done = chord_search(self.tool, self.targets, q, box, slopes=slopes, poses=poses)
         rest = np.flatnonzero(~done)
         if len(rest):
@@ -81,9 +94,9 @@ class CompensationProblem:
 
     def keep_mimics(self, found: Solution) -> Solution:
         """Shorten corrections that would take mimic joints of several joints beyond their limits."""
-        if not len(self.room.limits.matrix):
+        if not len(self.limits.matrix):
             return found
-        q = self.room.limits.within(self.room.start, found.q)
+        q = self.limits.within(self.start, found.q)
         changed = np.flatnonzero((q != found.q).any(1))
         poses, codes = found.poses.copy(), found.codes.copy()
         codes[changed] = CODE[Status.limit]
@@ -92,26 +105,13 @@ class CompensationProblem:
         poses[possible] = self.tool.poses(q[possible])
         return Solution(q, poses, codes)
 
-    def _without(self, nowhere: Array) -> Solution:
-        """Rows that start farther beyond a limit than the bound have no command."""
-        count, n = self.room.start.shape
-        q, poses = np.full((count, n), np.nan), self._no_poses(count)
-        codes = np.full(count, CODE[Status.limit])
-        rows = np.flatnonzero(~nowhere)
-        if len(rows):
-            q[rows], poses[rows], codes[rows] = self.take(rows)._solve()
-        return Solution(q, poses, codes)
-
-    def _no_poses(self, count: int) -> Array:
-        return np.full((count, self.targets.tools, 4, 4), np.nan)
-
     def _codes(self, q: Array, poses: Array, done: Array) -> Array:
         """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
         codes = np.where(done, CODE[Status.reached], CODE[Status.unreachable])
         rows = np.flatnonzero(~done)
         if not len(rows):
             return codes
-        at_limit = ((q[rows] <= self.room.limits.low) | (q[rows] >= self.room.limits.high)).any(1)
+        at_limit = ((q[rows] <= self.limits.low) | (q[rows] >= self.limits.high)).any(1)
         freed = rows[at_limit]
         freed = freed[self._reach(freed, limited=False)]
         codes[freed] = CODE[Status.limit]
@@ -123,14 +123,14 @@ class CompensationProblem:
         """(R,) whether rows reach their targets without the limits of their joints, or with a multiple of the bound."""
         if not len(rows):
             return np.zeros(0, dtype=bool)
-        box = self.room.box(rows, limited=limited, scale=scale)
+        box = self.box(rows, limited=limited, scale=scale)
         return box_search(self.tool, self.targets.take(rows), np.clip(box.start, box.low, box.high), box)[2]
 
     def _singular(self, rows: Array, q: Array, poses: Array) -> Array:
         """(R,) whether a singularity is to blame, at the start or at the nearest command ``q``."""
         if not len(rows):
             return np.zeros(0, dtype=bool)
-        start, targets = self.room.start[rows], self.targets.take(rows)
+        start, targets = self.start[rows], self.targets.take(rows)
         near, open_ = self._blames(targets, start, self.tool.poses(start), start)
         near_here, open_here = self._blames(targets, q, poses, start)
         found = (near & open_) | (near_here & open_here)
@@ -147,18 +147,18 @@ class CompensationProblem:
         Returns:
             (R,) boolean each.
         """
-        slopes = self._slopes(targets, q, poses)
-        error = targets.independent(targets.errors(poses) * targets.to_metres(self.tool.length))
+        slopes = self._slopes(targets, q)
+        error = targets.errors(poses) * targets.to_metres(self.tool.length)
         U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
         parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
         weak = s <= WEAK_DIRECTION_SHARE * s[:, :1]
         motion = parts / np.maximum(s, 1e-300)
-        strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.room.bound
+        strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.bound
         each, main = np.arange(len(q)), np.where(weak, np.abs(motion), -1.0).argmax(1)
         v, u, far, slope = Vt[each, main], U[each, :, main], parts[each, main], s[each, main]
-        bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.room.bound))
+        bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.bound))
         ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
-        length = self.tool.length * np.square(v * self.room.bound).sum(1)
+        length = self.tool.length * np.square(v * self.bound).sum(1)
         ends &= np.abs(bend) > BENT_WORKSPACE_CURVATURE * length
         near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
         return weak.any(1) & near, ~ends
@@ -166,13 +166,12 @@ class CompensationProblem:
     def _bend(self, targets: Targets, q: Array, way: Array) -> Array:
         """(R, k) second derivative of the tool along a way (R, n) of the joints."""
         ends = [q + side * DIFFERENCE * way for side in (1.0, -1.0)]
-        speeds = [self._slopes(targets, at, self.rough.poses(at)) @ (way / self.room.bound)[:, :, None] for at in ends]
+        speeds = [self._slopes(targets, at) @ (way / self.bound)[:, :, None] for at in ends]
         return (speeds[0] - speeds[1])[:, :, 0] / (2.0 * DIFFERENCE)
 
-    def _slopes(self, targets: Targets, q: Array, poses: Array) -> Array:
+    def _slopes(self, targets: Targets, q: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
-        slopes = targets.slopes(self.rough.jacobian(q), poses)
-        return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound
+        return targets.slopes(self.rough.jacobian(q)) * targets.to_metres(self.tool.length)[:, None] * self.bound
 
 
 WEAK_DIRECTION_SHARE = 0.1
@@ -217,31 +216,3 @@ class Status(str, Enum):
 
 MEMBERS = tuple(Status)
 CODE = {status: code for code, status in enumerate(MEMBERS)}
-
-
-@dataclass(frozen=True, eq=False)
-class Room:
-    """The parts of the boxes of N rows.
-
-    Args:
-        start: (N, n) rad or m. limits: of the joints, and of mimic joints.
-        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
-    """
-
-    start: Array
-    limits: Limits
-    bound: Array
-    mobility: Array
-
-    def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
-        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
-        start = self.start[rows]
-        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
-        low, high = start - motion, start + motion
-        if limited:
-            low, high = np.maximum(low, self.limits.low), np.minimum(high, self.limits.high)
-        return Box(start, low, high, self.mobility[rows])
-
-    def started(self, rows: Array, start: Array) -> Room:
-        """Of some rows (R,), from other starts (R, n)."""
-        return replace(self, start=start, mobility=self.mobility[rows])

@@ -4,8 +4,9 @@ With the tool at (p, R) and the target at (p*, R*), the miss that is made small 
 
     f = 1/2 |p* - p|^2 + L^2 (1 - cos angle),
 
-the angle being the one between R and R*, or between an axis a of the tool and its target a*. For small angles it is
-1/2 |p* - p|^2 + 1/2 (L angle)^2: the lever L weighs orientation against position. f is smooth at every angle. With the
+the angle being the one between R and R*, or between an axis a of the tool and its target a*: 1 - cos angle is the sum
+of 1 - a . a* over the axes, those of a pose by half. For small angles f is 1/2 |p* - p|^2 + 1/2 (L angle)^2: the lever
+L weighs orientation against position. f is smooth at every angle. With the
 Jacobian columns (v_j, w_j) of the tool, its gradient and Hessian need no further derivative of the kinematics, for in
 a chain of rigid bodies dv_j/dq_i = w_min(i,j) x v_max(i,j).
 """
@@ -13,6 +14,7 @@ a chain of rigid bodies dv_j/dq_i = w_min(i,j) x v_max(i,j).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,19 +40,19 @@ def cross(a: Array, b: Array) -> Array:
 class Targets:
     """N rows with a target for each of T tools: their costs add up, and their errors stand side by side.
 
+    An orientation says where A axes of a tool point: three for a pose, one for a direction, none for a position.
+
     Args:
         position: (N, T, 3) m.
-        rotation: (N, T, 3, 3) for poses, else None.
-        axis: (N, T, 3) unit vectors for one axis of each tool, else None.
-        tool_axis: (3,) that axis in the frame of the tool, a unit vector.
+        axes: (N, T, 3, A) orthonormal columns, the directions of these axes.
+        tool_axes: (3, A) the axes in the frame of the tool.
         lever: L in m.
         free: (N, T) True where a tool may be anywhere; None for targets of the single tool of a model.
     """
 
     position: Array
-    rotation: Array | None = None
-    axis: Array | None = None
-    tool_axis: Array | None = None
+    axes: Array
+    tool_axes: Array
     lever: float = 0.1
     free: Array | None = None
 
@@ -64,95 +66,71 @@ class Targets:
 
     def take(self, rows: Array) -> Targets:
         """The targets of some rows."""
-        parts = {name: getattr(self, name) for name in ("position", "rotation", "axis", "free")}
-        return replace(self, **{name: part if part is None else part[rows] for name, part in parts.items()})
+        free = None if self.free is None else self.free[rows]
+        return replace(self, position=self.position[rows], axes=self.axes[rows], free=free)
 
     @property
-    def oriented(self) -> bool:
-        """Whether the orientation counts."""
-        return self.rotation is not None or self.axis is not None
+    def weight(self) -> float:
+        """Of each axis: a turn by an angle moves two of three axes, but the single one of a direction."""
+        return 0.5 if self.axes.shape[3] == 3 else 1.0
+
+    @cached_property
+    def across(self) -> Array:
+        """(..., r, 3) unit vectors about which turns count: 3 of poses, 2 beside a single axis, 0 of positions."""
+        count = self.axes.shape[3]
+        if count != 1:
+            return np.eye(3)[:count]
+        axis = self.axes[..., 0]
+        across = cross(axis, np.eye(3)[np.abs(axis).argmin(2)])
+        across /= np.linalg.norm(across, axis=2, keepdims=True)
+        return np.stack([across, cross(axis, across)], axis=2)
 
     def to_metres(self, length: float) -> Array:
         """(T k,) factors that make errors comparable, a turn of one radian counting as ``length`` m."""
-        return np.array(([1.0] * 3 + [length / self.lever] * 3 * self.oriented) * self.tools)
+        return np.array(([1.0] * 3 + [length / self.lever] * self.across.shape[-2]) * self.tools)
 
     def errors(self, poses: Array) -> Array:
-        """Of poses (N, T, 4, 4), (N, T k) with k = 3 or 6: p* - p in m, and L times the turn that remains.
+        """Of poses (N, T, 4, 4), (N, T k) with k = 3 + r: p* - p in m, and L times the turn that remains.
 
-        -J^T errors = grad f; zero where a tool is free.
+        -slopes^T errors = grad f; zero where a tool is free.
         """
-        shift = self.position - poses[..., :3, 3]
-        if self.rotation is not None:
-            turn = 0.5 * cross(poses[..., :3, :3], self.rotation).sum(3)  # sin(angle) times its axis
-        elif self.axis is not None:
-            turn = self.axis - self._pointing(poses)
-        else:
-            return self._joined(shift)
-        return self._joined(np.concatenate([shift, self.lever * turn], axis=2))
+        turn = self.weight * cross(self._pointing(poses), self.axes).sum(3, keepdims=True)  # sin(angle) times its axis
+        return self._joined((self.position - poses[..., :3, 3])[..., None], turn)[..., 0]
 
-    def slopes(self, jacobian: Array, poses: Array) -> Array:
+    def slopes(self, jacobian: Array) -> Array:
         """Of Jacobians (N, T, 6, n), (N, T k, n): the decrease of the errors, to first order near the target."""
-        if not self.oriented:
-            return self._joined(jacobian[:, :, :3])
-        turning = jacobian[:, :, 3:]
-        if self.axis is not None:
-            turning = cross(turning, self._pointing(poses)[..., None])
-        return self._joined(np.concatenate([jacobian[:, :, :3], self.lever * turning], axis=2))
-
-    def independent(self, parts: Array) -> Array:
-        """Errors (N, 6 T) or slopes (N, 6 T, n) of directions in five coordinates; others are returned as they are."""
-        if self.axis is None:
-            return parts
-        first = np.eye(3)[np.abs(self.axis).argmin(2)]
-        across = cross(self.axis, first)
-        across /= np.linalg.norm(across, axis=2, keepdims=True)
-        basis = np.stack([across, cross(self.axis, across)], axis=2)  # (N, T, 2, 3), both perpendicular to the target
-        each = parts.reshape(len(parts), self.tools, 6, *parts.shape[2:] or (1,))
-        found = np.concatenate([each[:, :, :3], basis @ each[:, :, 3:]], axis=2)
-        return found.reshape(len(parts), 5 * self.tools, *parts.shape[2:])
+        return self._joined(jacobian[:, :, :3], jacobian[:, :, 3:])
 
     def cost(self, poses: Array) -> Array:
         """(N,) f in m^2, without cancellation near zero."""
         shift = self.position - poses[..., :3, 3]
-        cost = 0.5 * np.einsum("nti,nti->nt", shift, shift)
-        return self._counted(cost + self.lever**2 * self._versine(poses) if self.oriented else cost).sum(1)
+        return self._counted(0.5 * np.einsum("nti,nti->nt", shift, shift) + self.lever**2 * self._versine(poses)).sum(1)
 
     def misses(self, poses: Array) -> tuple[Array, Array | None]:
         """(N, T) distances in m, and angles in rad, None where only the position counts; zero where a tool is free."""
         distance = self._counted(np.linalg.norm(self.position - poses[..., :3, 3], axis=2))
-        if not self.oriented:
-            return distance, None
-        return distance, self._counted(2.0 * np.arcsin(np.sqrt(np.minimum(0.5 * self._versine(poses), 1.0))))
+        angle = self._counted(2.0 * np.arcsin(np.sqrt(np.minimum(0.5 * self._versine(poses), 1.0))))
+        return distance, angle if self.axes.shape[3] else None
 
     def curvature(self, jacobian: Array, poses: Array) -> Array:
         """(N, n, n) what the Hessian of f has beyond slopes^T slopes, for joints in a row from base to tip."""
         v, w = jacobian[:, :, :3], jacobian[:, :, 3:]  # (N, T, 3, n)
-        shift = self.position - poses[..., :3, 3]
+        shift, pointing, counted = self.position - poses[..., :3, 3], self._pointing(poses), self.across @ w
         upper = -cross(shift[..., None], w).swapaxes(2, 3) @ v  # -(shift x w_i) . v_j
-        if self.rotation is not None:
-            away = poses[..., :3, :3] @ self.rotation.swapaxes(2, 3)
-            trace = np.trace(away, axis1=2, axis2=3)[..., None, None]
-            turns = w.swapaxes(2, 3) @ w
-            upper += self.lever**2 * (0.5 * (trace * turns - w.swapaxes(2, 3) @ away @ w) - turns)
-        if self.axis is not None:
-            z = self._pointing(poses)
-            cosine = np.einsum("nti,nti->nt", z, self.axis)[..., None, None]
-            along, aimed = np.einsum("ntij,nti->ntj", w, z), np.einsum("ntij,nti->ntj", w, self.axis)
-            turns = w.swapaxes(2, 3) @ w
-            whole = cosine * turns - along[..., :, None] * aimed[..., None, :]
-            upper += self.lever**2 * (whole - (turns - along[..., :, None] * along[..., None, :]))
+        cosine = (pointing * self.axes).sum((2, 3))[..., None, None]
+        turns = w.swapaxes(2, 3)
+        bent = cosine * (turns @ w) - (turns @ pointing) @ (turns @ self.axes).swapaxes(2, 3)
+        upper += self.lever**2 * (self.weight * bent - counted.swapaxes(2, 3) @ counted)
         upper = self._counted(upper).sum(1)
         return np.triu(upper) + np.triu(upper, 1).swapaxes(1, 2)
 
     def _pointing(self, poses: Array) -> Array:
-        """(N, T, 3) the axis of each tool."""
-        return poses[..., :3, :3] @ self.tool_axis
+        """(N, T, 3, A) where the axes of each tool point."""
+        return poses[..., :3, :3] @ self.tool_axes
 
     def _versine(self, poses: Array) -> Array:
         """(N, T) 1 - cos angle."""
-        if self.rotation is not None:
-            return 0.25 * np.square(poses[..., :3, :3] - self.rotation).sum((2, 3))
-        return 0.5 * np.square(self._pointing(poses) - self.axis).sum(2)
+        return 0.5 * self.weight * np.square(self._pointing(poses) - self.axes).sum((2, 3))
 
     def _counted(self, values: Array) -> Array:
         """Values (N, T, ...) of tools, zero where one is free."""
@@ -160,10 +138,10 @@ class Targets:
             values[self.free] = 0.0
         return values
 
-    def _joined(self, parts: Array) -> Array:
-        """(N, T, k, ...) -> (N, T k, ...), zero where a tool is free."""
-        parts = parts if self.free is None else self._counted(parts.copy())
-        return parts.reshape(len(parts), parts.shape[1] * parts.shape[2], *parts.shape[3:])
+    def _joined(self, shifts: Array, turns: Array) -> Array:
+        """Shifts and turns (N, T, 3, n) -> (N, T k, n), zero where a tool is free."""
+        parts = self._counted(np.concatenate([shifts, self.lever * (self.across @ turns)], axis=2))
+        return parts.reshape(len(parts), parts.shape[1] * parts.shape[2], parts.shape[3])
 
 
 def finite_rows(value: object, name: str, shape: tuple[int | str, ...], fix: str) -> Array:
@@ -172,21 +150,6 @@ def finite_rows(value: object, name: str, shape: tuple[int | str, ...], fix: str
 
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-
-
-def for_each_tip(targets: Tensor, robot: Tree) -> bool:
-    """Whether the targets (N, T, 4, 4) or (N, T, 3) are those of all tips, rather than (N, 4, 4) or (N, 3) of one.
-
-    Raises:
-        InputError: another number of tips than the robot has.
-    """
-    if targets.ndim != 4 and not (targets.ndim == 3 and targets.shape[2] == 3):
-        return False
-    if targets.shape[1] != len(robot.tips):
-        fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"
-        what = f"`targets` of robot '{robot.name}'"
-        raise InputError.of(what, expected=f"{len(robot.tips)} tips", got=targets.shape[1], fix=fix)
-    return True
 
 
 def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, tool_axis: str, lever: float) -> Targets:
@@ -198,14 +161,17 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, to
         tool_axis: that axis, "x", "y" or "z". lever: how orientation weighs against position, m.
 
     Raises:
-        InputError: wrong shapes, values that are not finite, no rigid transforms, no directions, or a row in which all
-            tools are free.
+        InputError: wrong shapes, another number of tips than the robot's, values that are not finite, no rigid
+            transforms, no directions, or a row in which all tools are free.
     """
     fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
-    if not for_each_tip(targets, robot):
+    if targets.ndim != 4 and not (targets.ndim == 3 and targets.shape[2] == 3):
         finite_rows(targets, "targets", (rows, 4, 4) if targets.ndim == 3 else (rows, 3), fix)
         return Targets(**_parts(targets[:, None], axis, tool_axis, "row {}".format), lever=lever)
     tips, one = targets.shape[1], targets.shape[2:]
+    if tips != len(robot.tips):
+        fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"
+        raise InputError.of(f"`targets` of robot '{robot.name}'", expected=f"{len(robot.tips)} tips", got=tips, fix=fix)
     free = targets[..., :3, :].isnan().flatten(2).all(2) if len(one) == 2 else targets.isnan().all(2)
     idle = free.all(1).nonzero()[:, 0].tolist()
     if idle:
@@ -232,14 +198,14 @@ def _parts(targets: Tensor, axis: object, tool_axis: str, place: Any) -> dict[st
             raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
         found = rigid_poses(flat, lambda k: f"`targets`, {place(k)}") if len(flat) else flat
         poses = found.detach().cpu().numpy().astype(np.float64).reshape(*shape, 4, 4)
-        return {"position": poses[..., :3, 3], "rotation": poses[..., :3, :3]}
+        return {"position": poses[..., :3, 3], "axes": poses[..., :3, :3], "tool_axes": np.eye(3)}
     if not isinstance(tool_axis, str) or tool_axis not in AXES:
         raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
     position = targets.detach().cpu().numpy().astype(np.float64)
     if axis is None:
-        return {"position": position}
-    directions = _unit(real_tensor(axis, "axis"), len(flat), place).reshape(*shape, 3)
-    return {"position": position, "axis": directions, "tool_axis": np.array(AXES[tool_axis])}
+        return {"position": position, "axes": np.zeros((*shape, 3, 0)), "tool_axes": np.zeros((3, 0))}
+    directions = _unit(real_tensor(axis, "axis"), len(flat), place).reshape(*shape, 3, 1)
+    return {"position": position, "axes": directions, "tool_axes": np.array(AXES[tool_axis])[:, None]}
 
 
 def _unit(given: Tensor, count: int, place: Any) -> Array:
