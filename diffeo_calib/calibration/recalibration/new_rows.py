@@ -27,7 +27,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.estimate import row_blocks
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
-from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
+from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
@@ -378,10 +378,8 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
         raise AssertionError("rows that tell coordinates")
     (new, rows), T, fitted = before.coordinates, before.transform, before.fitted
     table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
-    noise = usual_noise(fitted, table)
-    if new.covariance is not None:
-        turn = torch.block_diag(*[T[:3, :3]] * new.markers)
-        noise = larger(noise, turn.mT @ new.covariance @ turn)
+    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
+    noise = noise_of_rows(fitted, new, T, block, 1.0)
     sets, table = SocketDevices.around_model(table, rows, seen)
     y = table.points.flatten(1)
     sensor = replace(NoiseModel.of(table, 0.0), known=None)

@@ -62,6 +62,8 @@ from diffeo_calib.sensors.set_ups import mounted_of
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
+REGISTERED_AS = {PLACES.same_registered_m: "same", PLACES.remounted_m: "moved", PLACES.other_registered_m: "other"}
+"""The same in a registration."""
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
 Drift = Literal["tested", "none"]
@@ -291,17 +293,12 @@ def weighed(before: Before, marker: str) -> NewRows:
     if before.place is None:
         return _weighed_by_ball(before, marker)
     odds = before.place.odds
-    most = max(odds, key=lambda metres: odds[metres])
-    if marker == "other" or (marker == "evidence" and most == PLACES.other_registered_m):
-        own = before.place.registration.markers
-        if before.new_ball:
-            own = torch.cat([own[:-1], before.own_markers[-1:]])
-        return _rows(before, own, "other").with_weights()
-    if marker != "evidence":
-        return _rows(before, before.own_markers, marker).with_weights()
-    free = _rows(before, before.own_markers, "moved").with_weights()
-    same = free.changed(marker_deviation=MARKER_DEVIATIONS["same"])
-    return same.with_weights() if same.log_evidence >= free.log_evidence - UNMOVED_LOG_ODDS else free
+    name = REGISTERED_AS[max(odds, key=lambda metres: odds[metres])] if marker == "evidence" else marker
+    markers = before.own_markers
+    if name == "other":
+        known = len(markers) - before.new_ball
+        markers = torch.cat([before.place.registration.markers[:known], markers[known:]])
+    return _rows(before, markers, name).with_weights()
 
 
 def _weighed_by_ball(before: Before, marker: str) -> NewRows:
