@@ -393,8 +393,9 @@ SHIFT = "shift"
 NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
 UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
 ENTRIES = {*NUMBERS, "same", "free", "outliers", "undetermined", SHIFT}
-LEARNT = "learnt"
-"""The entry of a registration whose rows the map knows as those of a fit: no map around another one."""
+LEARNT, TABLE = "learnt", "table_sha256"
+"""Entries of a registration whose rows the map knows as those of a fit: no map around another one. The first files did
+not have the second."""
 
 
 def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -402,6 +403,7 @@ def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str
     entry = {name: getattr(found, name) for name in (*NUMBERS, "same", "free")}
     shift = None if found.shift is None else found.shift.tolist()
     entry |= {"outliers": list(found.outliers), "undetermined": list(found.undetermined), SHIFT: shift}
+    entry |= {TABLE: found.table_sha256} if found.table_sha256 else {}
     return entry, {PREFIX + name: getattr(found, name) for name in ARRAYS}
 
 
@@ -411,7 +413,7 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
     Raises:
         InputError: entries that are missing or do not fit together.
     """
-    if not isinstance(entry, dict) or set(entry) - {LEARNT} != ENTRIES:
+    if not isinstance(entry, dict) or set(entry) - {LEARNT, TABLE} != ENTRIES:
         got = sorted(entry) if isinstance(entry, dict) else entry
         raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
     for name in NUMBERS:
@@ -428,7 +430,11 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
         as_tensor(arrays[name], PREFIX + name, shape)
     rigid(arrays["transform"], PREFIX + "transform")
     shift = None if entry[SHIFT] is None else as_tensor(entry[SHIFT], SHIFT, (markers, 3))
-    words = {"outliers": tuple(map(int, entry["outliers"])), "undetermined": tuple(map(str, entry["undetermined"]))}
+    words: dict[str, Any] = {
+        "outliers": tuple(map(int, entry["outliers"])),
+        "undetermined": tuple(map(str, entry["undetermined"])),
+    }
+    words |= {TABLE: str(entry.get(TABLE, ""))}
     return Registration(**arrays, **words, shift=shift, **{name: entry[name] for name in (*NUMBERS, "same", "free")})
 
 

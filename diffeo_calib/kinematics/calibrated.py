@@ -214,7 +214,8 @@ class CalibratedKinematics:
         asked = {"free": free, "marker_std": marker_std, "ball": ball, "learn": learn}
         placed, found = register_again(model.map, model.nominal, self.lever, rows, **asked)
         known = {"map": placed.to(self.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-        seen = self._with(**known, learnt=None if placed.registration else found)._carrying(self.nominal.load)
+        learnt = None if placed.registration else replace(found, table_sha256=measurements.sha256)
+        seen = self._with(**known, learnt=learnt)._carrying(self.nominal.load)
         seen = seen._with(placement=registered_devices(self, seen))
         return seen._with(placement=devices_beside(seen, measurements))
 

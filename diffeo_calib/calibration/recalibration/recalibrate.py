@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
@@ -227,7 +226,7 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
     fitted_map = fitted.model
-    if place.stands_free:
+    if found is None and place.fitted.workspace is not None:  # still no device says where the robot stands
         fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, found.transform)
@@ -290,28 +289,22 @@ def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
 
 def weighed(before: Before, marker: str) -> NewRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
-    if before.place is None:
-        return _weighed_by_ball(before, marker)
-    odds = before.place.odds
-    name = REGISTERED_AS[max(odds, key=lambda metres: odds[metres])] if marker == "evidence" else marker
-    markers = before.own_markers
-    if name == "other":
-        known = len(markers) - before.new_ball
-        markers = torch.cat([before.place.registration.markers[:known], markers[known:]])
-    return _rows(before, markers, name).with_weights()
-
-
-def _weighed_by_ball(before: Before, marker: str) -> NewRows:
-    """The same for rows that show a ball alone."""
-    own, ball = before.own_markers, before.known_ball
-    if ball is None:
+    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    if place is None and ball is None:
         return _rows(before, own, "same").with_weights()
-    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], ball[None]])}
+    other, known = own.clone(), slice(len(own) - before.new_ball)
+    if place is not None:
+        other[known] = place.registration.markers[known]
+    elif ball is not None:
+        other[-1] = ball
+    places = {"same": own, "moved": own, "other": other}
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
-    found = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
-    odds = {name: rows.log_evidence + UNMOVED_LOG_ODDS * (name == "same") for name, rows in found.items()}
-    return found[max(odds, key=lambda name: odds[name])]
+    if place is not None:
+        name = REGISTERED_AS[place.best.metres]
+        return _rows(before, places[name], name).with_weights()
+    every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
+    return max(every.items(), key=lambda each: each[1].log_evidence + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
 
 
 def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:

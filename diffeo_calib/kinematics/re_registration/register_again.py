@@ -120,12 +120,9 @@ def _learnt(fit: FittedMap, nominal: GeometryMap, found: Estimate) -> FittedMap:
 
 
 class FoundPlace(NamedTuple):
-    """Result of a registration: the most probable estimate, the probability of each prior deviation of the markers, m,
-    and the record.
-    """
+    """Result of a registration: the most probable estimate, and the record."""
 
     best: Estimate
-    odds: dict[float, float]
     registration: Registration
 
 
@@ -164,7 +161,7 @@ def find_place(
         outliers += kept[worst].tolist()
         kept = kept[[row for row in range(len(kept)) if row not in worst]]
     odds = _odds(starts, priors)
-    best = _likeliest(starts, max(odds, key=lambda metres: odds[metres]))
+    best = _likeliest(starts, max(odds, key=odds.__getitem__))
     said = {
         "free": free,
         "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
@@ -172,7 +169,7 @@ def find_place(
         "excess": float(plain.scale()[0]) ** 0.5,
         "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
     }
-    return FoundPlace(best, odds, _record(best, said))
+    return FoundPlace(best, _record(best, said))
 
 
 def registration_rows(data: Any, model: Any) -> Measurements | None:
