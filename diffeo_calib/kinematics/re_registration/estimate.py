@@ -40,9 +40,6 @@ from diffeo_calib.robots.placement import PLACES
 MAX_STEPS = 100
 SETTLED = 1e-9
 """The iteration ends with a step below this, m and rad."""
-SETTLED_WEIGHT = 1e-6
-FREEDOM = 4.0
-"""Degrees of freedom nu of Student's t: errors of real robots have heavy tails, which few rows cannot average out."""
 PRIOR_FREEDOM = 10.0
 """The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
 FALSE_ALARM_PROBABILITY = 0.001
@@ -55,13 +52,11 @@ class Estimate:
     """The best place under one prior, and what the rows say about it.
 
     Args:
-        place: where rows, frame and body are linearised. weights: (M,) of the rows.
-        metres: prior deviation of the body from its old place, m.
+        place: where rows, frame and body are linearised. metres: prior deviation of the body from its old place, m.
         opened: whether B is the covariance of that place by the fit, or zero.
     """
 
     place: Place
-    weights: Tensor
     metres: float
     opened: bool
 
@@ -87,13 +82,12 @@ class Estimate:
 
     @cached_property
     def V(self) -> Tensor:
-        """(M m, M m), the covariance of doubted rows enlarged, what is not free as an earlier registration knows it."""
-        own, M = self.place.session, len(self.weights)
+        """(M m, M m), with what is not free as an earlier registration knows it."""
+        own = self.place.session
         Z = own.shared.flatten(0, 1)
         held = self.place.by_unknowns.flatten(0, 1) * ~own.free
         V = self.place.C + torch.block_diag(*own.noise) + Z @ Z.mT + held @ own.earlier @ held.mT
-        V = 0.5 * (V + V.mT)
-        return V + torch.block_diag(*(row_blocks(V, M) * (doubt(self.weights) - 1.0)[:, None, None]))
+        return 0.5 * (V + V.mT)
 
     @cached_property
     def mean(self) -> Tensor:
@@ -125,14 +119,9 @@ class Estimate:
         return self.factor.solve(self.target[:, None])[:, 0]
 
     @cached_property
-    def usual_blocks(self) -> Tensor:
-        """(M, m, m) the covariance of each row, as if none was doubted."""
-        return row_blocks(self.V, len(self.weights)) / doubt(self.weights)[:, None, None]
-
-    @cached_property
     def gain(self) -> Tensor:
         """A (f, M m)."""
-        weighted = torch.linalg.solve(self.place.session.noise / self.weights[:, None, None], self.S)  # (M, m, f)
+        weighted = torch.linalg.solve(self.place.session.noise, self.S)  # (M, m, f)
         wide = self.prior + self.opened * self.place.session.by_fit[self.free[:, None], self.free]
         inverse = torch.linalg.inv(torch.linalg.inv(wide) + (weighted.mT @ self.S).sum(0))
         return inverse @ weighted.flatten(0, 1).mT
@@ -153,17 +142,9 @@ class Estimate:
         """(M, m) what remains of the residual after the step."""
         return self.residual - self.S @ self.step
 
-    @property
-    def student_t_weights(self) -> Tensor:
-        """(M,) weights of Student's t: (nu + m) / (nu + r^T V^-1 r) of each row's residual after the step."""
-        left = self.left[..., None]
-        squares = (left.mT @ torch.linalg.solve(self.usual_blocks, left))[:, 0, 0]
-        return (FREEDOM + self.visible.sum(1)) / (FREEDOM + squares)
-
-    @property
-    def log_evidence(self) -> float:
-        """log N(r; S mu, K)."""
-        return self.factor.log_density(self.target, self.solved)
+    def log_evidence(self, scale: float = 1.0) -> float:
+        """log N(r; S mu, scale K), but for a constant."""
+        return self.factor.log_density(self.target, self.solved / scale)
 
     @cached_property
     def alone(self) -> Tensor:
@@ -189,7 +170,7 @@ class Estimate:
         to_error = torch.eye(M * m, dtype=flat.dtype, device=flat.device) - flat @ self.gain
         to_error = (self.alone @ to_error.view(M, m, -1)).flatten(0, 1)
         whole = to_error @ (self.V + flat @ self.prior @ flat.mT) @ to_error.mT
-        covariance = row_blocks(whole, M) - row_blocks(self.V, M) + self.usual_blocks  # a new row is not doubted
+        covariance = row_blocks(whole, M)
         markers, errors = m // 3, self.left_out.unflatten(1, (-1, 3))
         away = errors.nan_to_num(0.0)[..., None]
         squares = (away.mT @ torch.linalg.solve(own_blocks(covariance, markers), away))[..., 0, 0]
@@ -228,51 +209,33 @@ class Estimate:
         return []
 
 
-def doubt(weights: Tensor) -> Tensor:
-    """Factors (M,), one or more, by which rows of these weights vary more than model and noise lead to expect.
-
-    A row that fits well has a weight above one, and is no better known for that. What a row varies more is its own, so
-    that errors of the model which rows share keep their covariance C: with less of them the covariance of a prediction
-    would not be positive.
-    """
-    return (1.0 / weights).clamp(min=1.0)
-
-
 def row_blocks(V: Tensor, rows: int) -> Tensor:
     """The blocks (M, m, m) of a matrix (M m, M m) on its diagonal."""
     each = torch.arange(rows, device=V.device)
     return V.view(rows, -1, rows, len(V) // rows)[each, :, each]
 
 
-def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:
-    """The better estimate with B and without, by errors of rows left out, of which those that fit badly count less.
+def estimate(start: Place, metres: float) -> Estimate:
+    """The better estimate with B and without, by errors of rows left out.
 
     Args:
         start: where to begin. metres: prior deviation of the markers from their old places, m.
-        weights: (M,) of the rows; by default those of Student's t, by iteration.
     """
-
-    def left_out(found: Estimate) -> float:
-        squares, counts = found.left_out.square().nanmean(1), found.weights.clamp(max=1.0)
-        return float((counts * squares).nansum() / counts.sum())
-
     session = start.session
     known_well = max(metres**2, float(session.fitted.new_noise.diagonal().mean()))
     may = float(session.by_fit.diagonal().max()) > known_well and bool(session.free[6:].any())
-    return min((_estimate(start, metres, weights, opened=opened) for opened in (True, False)[: 1 + may]), key=left_out)
+    found = [_estimate(start, metres, opened=opened) for opened in (True, False)[: 1 + may]]
+    return min(found, key=lambda each: float(each.left_out.square().nanmean()))
 
 
-def _estimate(place: Place, metres: float, weights: Tensor | None, *, opened: bool) -> Estimate:
+def _estimate(place: Place, metres: float, *, opened: bool) -> Estimate:
     """Gauss-Newton from a start; arguments as of :func:`estimate`."""
-    given = place.C.new_ones(len(place.points)) if weights is None else weights
     for _ in range(MAX_STEPS):
-        found = Estimate(place, given, metres, opened)
-        again = given if weights is not None else found.student_t_weights
-        if float(found.step.abs().max()) < SETTLED and float((again - given).abs().max()) < SETTLED_WEIGHT:
-            if place.exact:
-                break
+        found = Estimate(place, metres, opened)
+        if float(found.step.abs().max()) >= SETTLED:
+            place = place.stepped(place.C.new_zeros(len(place.session.free)).index_copy(0, found.free, found.step))
+        elif place.exact:
+            break
+        else:
             place = Place.of(place.session, place.T, place.body, place.C)
-            continue
-        step = place.C.new_zeros(len(place.session.free)).index_copy(0, found.free, found.step)
-        place, given = place.stepped(step), again
     return found

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from math import exp, log, nan
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -24,7 +23,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates, joins
-from diffeo_calib.kinematics.re_registration.estimate import Estimate, doubt, estimate
+from diffeo_calib.kinematics.re_registration.estimate import Estimate, estimate
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
     Registration,
@@ -56,7 +55,6 @@ LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
 NEGLIGIBLE_PROBABILITY = 0.01
 """Priors that are less probable count no more."""
-_EVIDENCE = attrgetter("log_evidence")
 
 
 @small_work()
@@ -104,7 +102,7 @@ def _learnt(fit: FittedMap, nominal: GeometryMap, found: Estimate) -> FittedMap:
         payload=session.nominal.payload,
         q=session.data.q,
         y=session.seen(place.T).flatten(1).nan_to_num(0.0),
-        noise=session.noise * doubt(found.weights)[:, None, None],
+        noise=session.noise,
         seen=found.visible,
         shared=session.shared,
         new_noise=_mean_noise(found),
@@ -152,21 +150,19 @@ def find_place(
     while True:
         part = session.rows(kept)
         starts = _starts(part, max(priors))
-        plain = max(
-            (_likeliest(starts, metres, torch.ones_like(part.data.q[:, 0])) for metres in priors), key=_EVIDENCE
-        )
-        worst = plain.worst_rows()
+        found = {metres: _likeliest(starts, metres) for metres in priors}
+        odds = _odds(found)
+        best = found[max(odds, key=odds.__getitem__)]
+        worst = best.worst_rows()
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
         outliers += kept[worst].tolist()
         kept = kept[[row for row in range(len(kept)) if row not in worst]]
-    odds = _odds(starts, priors)
-    best = _likeliest(starts, max(odds, key=odds.__getitem__))
     said = {
         "free": free,
         "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
         "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if session.known else None,
-        "excess": float(plain.scale()[0]) ** 0.5,
+        "excess": float(best.scale()[0]) ** 0.5,
         "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
     }
     return FoundPlace(best, _record(best, said))
@@ -267,16 +263,16 @@ def _starts(session: Session, widest: float) -> list[Place]:
     return [Place.of(session, *start) for start in starts]
 
 
-def _likeliest(starts: list[Place], metres: float, weights: Tensor | None = None) -> Estimate:
+def _likeliest(starts: list[Place], metres: float) -> Estimate:
     """The likeliest estimate under a prior."""
     usable = starts if metres >= OTHER_MARKER else starts[:1]
-    return max((estimate(start, metres, weights) for start in usable), key=_EVIDENCE)
+    return max((estimate(start, metres) for start in usable), key=Estimate.log_evidence)
 
 
-def _odds(starts: list[Place], priors: tuple[float, ...]) -> dict[float, float]:
-    """Probabilities of the priors that count, with the weights of the rows that the widest one finds."""
-    weights = _likeliest(starts, priors[-1]).weights
-    logs = {metres: _likeliest(starts, metres, weights).log_evidence for metres in priors}
+def _odds(found: dict[float, Estimate]) -> dict[float, float]:
+    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
+    scale = max(1.0, float(found[max(found)].scale()[0]))
+    logs = {metres: each.log_evidence(scale) for metres, each in found.items()}
     logs |= {SAME_PLACE: logs[SAME_PLACE] + UNMOVED_LOG_ODDS} if SAME_PLACE in logs else {}
     odds = {metres: exp(each - max(logs.values())) for metres, each in logs.items()}
     likely = {metres: each for metres, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
@@ -293,7 +289,7 @@ def _record(best: Estimate, said: dict[str, Any]) -> Registration:
     out = torch.block_diag(R, R, body.slopes)
     covariance = out @ whole @ out.mT
     covariance = 0.5 * (covariance + covariance.mT)
-    usual = float(best.V.diagonal()[best.visible.flatten()].median().sqrt())
+    usual = float((best.inflation * best.V.diagonal()[best.visible.flatten()].median()).sqrt())
     arm = float((session.seen(place.T) - session.centre).square().sum(-1).nanmean().sqrt())
     geometry, count = session.nominal.geometry, len(body.points)
     tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
