@@ -287,8 +287,7 @@ class CalibratedKinematics:
         return self.geometry.on
 
     def __repr__(self) -> str:
-        fitted = f"fitted to {len(self.configurations)} poses"
-        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, {fitted})"
+        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses)"
 
     def _repr_html_(self) -> str:
         """For notebooks: robot, measurements, errors at the fit and provenance."""

@@ -85,6 +85,11 @@ class Before:
         return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
 
     @property
+    def stands_free(self) -> bool:
+        """Whether still no device says where the robot stands."""
+        return self.place is None and self.fitted.workspace is not None
+
+    @property
     def own_markers(self) -> Tensor:
         """(P, 3) the markers of the map, in the frames of their tips, m."""
         theta = self.fitted.deformation.momenta.theta

@@ -226,7 +226,7 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
     fitted_map = fitted.model
-    if found is None and place.fitted.workspace is not None:  # still no device says where the robot stands
+    if place.stands_free:
         fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, found.transform)

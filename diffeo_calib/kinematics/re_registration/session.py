@@ -70,7 +70,8 @@ class Session:
         old = seen.at(markers if known else seen.nowhere(data.markers, data.points))
         numbers = torch.arange(6 + len(old.from_old), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
-        _check_enough(data, (6 if free != "marker" else 0) + (0 if known else len(numbers) - 6), int(may[:6].any()))
+        framed = free != "marker"
+        _check_enough(data, 6 * framed + (0 if known else len(numbers) - 6), framed=framed)
         return cls(model, nominal, data, old, known, may)
 
     def rows(self, keep: Tensor) -> Session:
@@ -222,7 +223,7 @@ class Place:
         return replace(self, T=T, body=body, points=points, exact=self.exact and moved == 0.0)
 
 
-def _check_enough(data: Measurements, unknowns: int, framed: int) -> None:
+def _check_enough(data: Measurements, unknowns: int, *, framed: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
     each = data.bodies.numbers * float(data.seen_bodies.sum()) / len(data)
     points = -(-LEAST_POINTS // data.markers) if framed else 1
