@@ -21,7 +21,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     LARGEST_ERROR_PER_REACH,
     causes_of,
-    expected_covariance,
+    expected,
     expected_error,
     impossible,
     impossible_errors,
@@ -188,20 +188,18 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
     Args:
         model: a calibrated model. data: its markers. bodies: how many of them, or of its frames, a device measured.
     """
-    covariance = expected_covariance(model, data)[:, :bodies]
+    covariance = expected(model, data).places[:, :bodies]
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
 
 
 def larger_than_expected(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> list[str]:
     """A sentence about errors above twice the expected ones."""
-    expected = expected_rms(model, data, errors.errors.shape[1])
-    if errors.rms < gates.LARGE_PER_EXPECTED * expected:
+    usual = expected_rms(model, data, errors.errors.shape[1])
+    if errors.rms < gates.LARGE_PER_EXPECTED * usual:
         return []
-    what = (
-        f"the errors are {errors.rms / expected:.1f} times as large as the model expects: RMS {1e3 * errors.rms:.3f} mm"
-    )
+    what = f"the errors are {errors.rms / usual:.1f} times as large as the model expects: RMS {1e3 * errors.rms:.3f} mm"
     fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
-    return [sentence(what, expected=f"about {1e3 * expected:.3f} mm", fix=fix)]
+    return [sentence(what, expected=f"about {1e3 * usual:.3f} mm", fix=fix)]
 
 
 @dataclass(frozen=True)

@@ -389,18 +389,18 @@ PREFIX = "registration_"
 ARRAYS = ("transform", "markers", "covariance", "centre", "q", "gain", "noise")
 REGISTRATION = tuple(PREFIX + name for name in ARRAYS)
 """Names of the tensors."""
-SHIFT = "shift"
 NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
 UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
-ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", SHIFT)
-LEARNT = "learnt"
-"""The entry of a registration whose rows the map knows as those of a fit: no map around another one."""
+ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", "shift")
+LEARNT, TABLE = "learnt", "table_sha256"
+"""Entries of a registration that the map learnt from, no map around another one; the first files had no table."""
 
 
 def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Its entry in the header, and its tensors."""
     entry = {name: getattr(found, name) for name in ENTRIES}
-    entry[SHIFT] = None if found.shift is None else found.shift.tolist()
+    entry["shift"] = None if found.shift is None else found.shift.tolist()
+    entry |= {TABLE: found.table_sha256} if found.table_sha256 else {}
     return entry, {PREFIX + name: getattr(found, name) for name in ARRAYS}
 
 
@@ -410,7 +410,7 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
     Raises:
         InputError: entries that are missing or do not fit together.
     """
-    if not isinstance(entry, dict) or set(entry) - {LEARNT} != set(ENTRIES):
+    if not isinstance(entry, dict) or set(entry) - {LEARNT, TABLE} != set(ENTRIES):
         got = sorted(entry) if isinstance(entry, dict) else entry
         raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
     for name in NUMBERS:
@@ -420,15 +420,15 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
         expected = "a boolean `same`, and `free` of both, base or marker"
         raise InputError.of("the entry registration", expected=expected, got=(entry["same"], entry["free"]))
     arrays = {name: tensors[PREFIX + name] for name in ARRAYS}
-    markers, rows = len(arrays["markers"]), len(arrays["q"])
-    k, m = 6 + 3 * markers, 3 * markers
-    shapes = {"markers": (markers, 3), "covariance": (k, k), "centre": (3,), "q": (rows, n), "gain": (k, m * rows)}
-    for name, shape in (shapes | {"noise": (m, m)}).items():
+    m, rows = 3 * len(arrays["markers"]), len(arrays["q"])
+    shapes = {"markers": (m // 3, 3), "centre": (3,), "q": (rows, n), "gain": (m + 6, m * rows)}
+    for name, shape in (shapes | {"noise": (m, m), "covariance": (m + 6, m + 6)}).items():
         as_tensor(arrays[name], PREFIX + name, shape)
     rigid(arrays["transform"], PREFIX + "transform")
-    shift = None if entry[SHIFT] is None else as_tensor(entry[SHIFT], SHIFT, (markers, 3))
+    shift = None if entry["shift"] is None else as_tensor(entry["shift"], "shift", (m // 3, 3))
     words = {"outliers": tuple(map(int, entry["outliers"])), "undetermined": tuple(map(str, entry["undetermined"]))}
-    return Registration(**arrays, **words, shift=shift, **{name: entry[name] for name in (*NUMBERS, "same", "free")})
+    named = {name: entry[name] for name in (*NUMBERS, "same", "free")} | {TABLE: str(entry.get(TABLE, ""))}
+    return Registration(**arrays, **words, **named, shift=shift)
 
 
 SHARED = "shared_noise"

@@ -214,7 +214,8 @@ class CalibratedKinematics:
         asked = {"free": free, "marker_std": marker_std, "ball": ball, "learn": learn}
         placed, found = register_again(model.map, model.nominal, self.lever, rows, **asked)
         known = {"map": placed.to(self.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-        seen = self._with(**known, learnt=None if placed.registration else found)._carrying(self.nominal.load)
+        learnt = None if placed.registration else replace(found, table_sha256=measurements.sha256)
+        seen = self._with(**known, learnt=learnt)._carrying(self.nominal.load)
         seen = seen._with(placement=registered_devices(self, seen))
         return seen._with(placement=devices_beside(seen, measurements))
 
@@ -286,8 +287,7 @@ class CalibratedKinematics:
         return self.geometry.on
 
     def __repr__(self) -> str:
-        fitted = f"fitted to {len(self.configurations)} poses"
-        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, {fitted})"
+        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses)"
 
     def _repr_html_(self) -> str:
         """For notebooks: robot, measurements, errors at the fit and provenance."""

@@ -250,17 +250,16 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
     """A sentence about errors that no calibrated robot has: expected and found median, what to check; else None."""
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
-    medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
+    found, options = expected(model, data), sensor_of(data).options
+    medians = [(errors.median, _typical(found.places), 1e3, "mm", largest)]
     if errors.angle_median is not None:
-        some = _some(data)
-        covariance = _expected(model, some).covariance[..., 3:, 3:]
-        medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
-    options = sensor_of(data).options
-    for median, expected, per_unit, unit, most in medians:
-        if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
+        turns = found.covariance[..., 3:, 3:]
+        medians.append((radians(errors.angle_median), _typical(turns), degrees(1.0), "degrees", inf))
+    for median, usual, per_unit, unit, most in medians:
+        if median > min(most, LARGEST_ERROR_PER_EXPECTED * usual):
             return sentence(
                 "these errors are not those of a calibrated robot",
-                expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
+                expected=f"a median of about {per_unit * usual:.2g} {unit} by the model's own uncertainty",
                 got=f"{per_unit * median:.3g} {unit}",
                 fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
                 "device nor the markers have moved: a model predicts in the measuring frame of its fit (if they "
@@ -271,21 +270,13 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
 
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
-    return _typical(expected_covariance(model, data))
+    return _typical(expected(model, data).places)
 
 
-def expected_covariance(model: CalibratedKinematics, data: Measurements) -> Tensor:
-    """(M, B, 3, 3) covariances of new positions at evenly spaced rows, m^2: of markers, or of origins of poses."""
-    return _expected(model, _some(data)).places
-
-
-def _expected(model: CalibratedKinematics, data: Measurements) -> Predicted:
-    return model.bodies.predicted(model.at_payloads(data.payload), data.q)
-
-
-def _some(data: Measurements) -> Measurements:
-    """Evenly spaced rows, at most :data:`MOST_EXPECTED`."""
-    return data.rows(slice(None, None, -(-len(data) // MOST_EXPECTED)))
+def expected(model: CalibratedKinematics, data: Measurements) -> Predicted:
+    """New measurements as a model predicts them at evenly spaced rows, at most :data:`MOST_EXPECTED`."""
+    some = data.rows(slice(None, None, -(-len(data) // MOST_EXPECTED)))
+    return model.bodies.predicted(model.at_payloads(some.payload), some.q)
 
 
 def _typical(covariance: Tensor) -> float:

@@ -36,6 +36,15 @@ def test_the_table_of_the_fit_would_count_twice(arm: Case) -> None:
         dc.recalibrate(arm.model, arm.train)
 
 
+def test_rows_that_a_registration_learnt_from_would_count_twice(
+    arm: Case, new: dc.Measurements, tmp_path: Path
+) -> None:
+    dc.save(arm.model.registered(new), tmp_path / "model")
+    with pytest.raises(InputError, match="fitted to 20 of these 20 measurements: they would count twice; pass rows"):
+        dc.recalibrate(dc.load(tmp_path / "model"), new)  # pyright: ignore[reportArgumentType]
+    dc.recalibrate(arm.model.registered(new, learn=False), new)
+
+
 def test_other_units_are_refused_before_the_work(arm: Case, new: dc.Measurements) -> None:
     for factor in (1e3, 1e-3):
         with pytest.raises(MeasurementError, match=r"the new rows do not have the robot's size.*check `length`"):

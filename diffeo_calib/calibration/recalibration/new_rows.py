@@ -27,10 +27,11 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.estimate import row_blocks
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
-from diffeo_calib.kinematics.re_registration.usual_noise import larger, usual_noise
+from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
@@ -83,7 +84,7 @@ class NewRows:
             before: see the class. markers: (P, 3) near which they are, in the frames of their tips, m.
             marker_deviation: see the class.
         """
-        points = FlangePoints(before.at_rows, markers, same=True)
+        points = FlangePoints(before.nominal.under(before.data.payload), markers, same=True)
         seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
         model, noise, known = _measured(before, seen)
         tails = Tails.none(len(seen), model.bodies, device=seen.device)
@@ -348,16 +349,23 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     """How rows in the model's frame were measured, their noise, and what; the devices around its points (M, 3 P), m."""
     told, noise, sets = None, None, list[DeviceSet]()
     if before.coordinates is not None:
-        told, noise, sets = _coordinates(before, seen)
+        told, noise, sets = _coordinates(before, *before.coordinates, seen)
     sets += before.sessions
-    readings = [_around(one.table, one.rows, seen) for one in before.readings]
+    points, readings = seen.unflatten(1, (-1, 3)), list[ReadingDevices]()
+    for table, own in before.readings:
+        numbers = torch.arange(table.values.shape[1], device=own.device)
+        readings.append(ReadingDevices(table, fitting_devices(table, points[own]), own, numbers))
     if told is not None and noise is not None and len(told.rows) == len(seen):
         return told.noise_model, noise, {"y": told.y, "placement": Placement(tuple(sets))}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
-    total = torch.diag_embed(torch.full_like(rows.y, usual_variance(before.fitted.noise)))
+    old = before.fitted.noise
+    usual = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # variance of what was measured, m^2
+    total = torch.diag_embed(usual.expand_as(rows.y))
     if told is not None and noise is not None:
-        total[told.rows] = total[told.rows] * 0.0 + _padded(noise, rows.y.shape[1])
+        own = total[told.rows]
+        own[:, : noise.shape[1], : noise.shape[1]] = noise
+        total[told.rows] = own
     if rows.noise_model.known is not None:
         total = larger(total, rows.noise_model.known)
     model = replace(rows.noise_model, known=None)
@@ -365,23 +373,12 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     return model, without_hidden(total, visible), known
 
 
-def _padded(noise: Tensor, size: int) -> Tensor:
-    """Blocks (N, m, m) as the first ones of (N, R, R), unit variance elsewhere."""
-    rest = torch.eye(size, dtype=noise.dtype, device=noise.device).repeat(len(noise), 1, 1)
-    rest[:, : noise.shape[1], : noise.shape[1]] = noise
-    return rest
-
-
-def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
-    """Rows that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
-    if before.coordinates is None:
-        raise AssertionError("rows that tell coordinates")
-    (new, rows), T, fitted = before.coordinates, before.transform, before.fitted
+def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
+    """Rows (M,) that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
+    T, fitted = before.transform, before.fitted
     table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
-    noise = usual_noise(fitted, table)
-    if new.covariance is not None:
-        turn = torch.block_diag(*[T[:3, :3]] * new.markers)
-        noise = larger(noise, turn.mT @ new.covariance @ turn)
+    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
+    noise = noise_of_rows(fitted, new, T, block, 1.0)
     sets, table = SocketDevices.around_model(table, rows, seen)
     y = table.points.flatten(1)
     sensor = replace(NoiseModel.of(table, 0.0), known=None)
@@ -389,14 +386,3 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
         y = torch.where(y.isnan(), seen[rows], y)
         noise = without_hidden(noise, sensor.coordinates(y))
     return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
-
-
-def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
-    """The devices of readings around the points of the old model."""
-    devices = fitting_devices(table, seen[rows].unflatten(1, (-1, 3)))
-    return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
-
-
-def usual_variance(noise: Noise) -> float:
-    """Median variance of the numbers that were measured, m^2."""
-    return float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].median())

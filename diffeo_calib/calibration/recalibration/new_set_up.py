@@ -33,7 +33,6 @@ from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, sensor_of
 from diffeo_calib.sensors.set_ups import mounted_of
@@ -86,19 +85,9 @@ class Before:
         return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
 
     @property
-    def at_rows(self) -> GeometryMap:
-        """The nominal map under the payloads of the new rows."""
-        return self.nominal.under(self.data.payload)
-
-    @property
     def stands_free(self) -> bool:
         """Whether still no device says where the robot stands."""
         return self.place is None and self.fitted.workspace is not None
-
-    @property
-    def known_ball(self) -> Tensor | None:
-        """The ball of the new rows if the old ones showed it."""
-        return None if self.new_ball else self.ball
 
     @property
     def own_markers(self) -> Tensor:
@@ -131,15 +120,16 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     """
     new = new.to(HOST)
     check_shown(new)
-    _check_robot(model, new)
     own, readings = divided(new)
-    check_kinds(model, own, readings)
+    _check_robot(model, new, own, readings)
     old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
-    ball = _ball(old, nominal, own, readings)
+    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])  # without deformation
+    ball, tip = None if own is None else ball_in_sockets(own.table, geometry), nominal.geometry.on[-1]
+    ball = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip)) if ball is None else ball
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), PLACES.found_m_rad)
+        old = with_ball(old, nominal, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
         nominal = robot_map(old)
     place, sessions = None, list[DeviceSet]()
     if own is not None:
@@ -148,7 +138,8 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         device = measured_rows(own.table)
         if device is not None:
             place, seen = _place_of_device(old, nominal, model.lever, device.table, REGISTERED_M.get(marker))
-            geometry = _in_frame(old, nominal, place.registration.transform)
+            geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+            geometry = replace(geometry, base=place.registration.transform @ geometry.base)
             sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
@@ -158,13 +149,18 @@ def knows_ball(model: CalibratedKinematics) -> bool:
     return model.ball or model.map.unregistered.workspace is not None
 
 
-def _check_robot(model: CalibratedKinematics, new: Any) -> None:
+def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None, readings: list[OtherReadings]) -> None:
+    """Raise InputError for rows of another robot, or that show other markers than those of the calibration."""
     check_same_robot(model, new)
     rare = [name for table, _ in rows_of_one_kind(new) for name in sensor_of(table).rare(table)]
     if rare:
         what = f"rows that say nothing, since they are alone in their socket: {few(rare)}"
         warn_user(sentence(what, fix="check the names, or measure more rows there"))
     model.nominal.load.under(new.payload).checked()
+    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
+    if model.registration is not None:  # at other markers than those of the calibration
+        other = "measure the markers of the calibration itself, or calibrate again with all rows"
+    check_markers(Shown(model.nominal.geometry.markers, model.lever, model.ball, other), own, readings)
 
 
 def _place_of_device(
@@ -178,26 +174,15 @@ def _place_of_device(
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest, marker_std=marker_std)
-    check_place(place.registration)
-    T = place.registration.transform
+    turn, T = float(place.registration.frame_deviations[3:].max()), place.registration.transform
+    if turn > LARGEST_TURN_RAD:
+        raise MeasurementError.of(
+            "the new rows do not tell where the measuring device stands",
+            expected="markers that are not all on one line or at one place",
+            got=f"its turn is known to {degrees(turn):.2g} degrees only",
+            fix="measure poses in which several joints move",
+        )
     return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
-
-
-def _in_frame(old: FittedMap, nominal: GeometryMap, T: Tensor) -> Geometry:
-    """The geometry of the old map without deformation, in a frame seen from its own by T (4, 4), m."""
-    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
-    return replace(geometry, base=T @ geometry.base)
-
-
-def _ball(
-    old: FittedMap, nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]
-) -> Tensor | None:
-    """(3,) where new rows put a ball on its tip, if the joints are as the old map says without deformation, m."""
-    geometry = _in_frame(old, nominal, torch.eye(4, dtype=nominal.geometry.base.dtype, device=HOST))
-    ball = None if own is None else ball_in_sockets(own.table, geometry)
-    if ball is not None:
-        return ball
-    return ball_of([one.table for one in readings], geometry, ball_tip(own, readings, geometry.on[-1]))
 
 
 def with_ball(fitted: FittedMap, nominal: GeometryMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
@@ -229,10 +214,8 @@ def with_ball(fitted: FittedMap, nominal: GeometryMap, ball: Tensor, tip: str, d
 def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None:
     """k0 of the controls with the ball at one place in all of them."""
     if isinstance(by_row, SessionMarkers):
-        ball = after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)
-        return SessionMarkers(
-            after.with_payload(by_row.nominal.payload), by_row.session, torch.cat([by_row.tools, ball], 1)
-        )
+        tools = torch.cat([by_row.tools, after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)], 1)
+        return SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
     return after.with_payload(by_row.payload) if isinstance(by_row, GeometryMap) else by_row
 
 
@@ -260,17 +243,9 @@ def check_arguments(model: object, new: object, marker: object) -> None:
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
 
 
-def check_kinds(model: CalibratedKinematics, own: Coordinates | None, readings: list[OtherReadings]) -> None:
-    """Raise InputError for rows that show other markers than those of the calibration."""
-    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
-    if model.registration is not None:  # at other markers than those of the calibration
-        other = "measure the markers of the calibration itself, or calibrate again with all rows"
-    check_markers(Shown(model.nominal.geometry.markers, model.lever, model.ball, other), own, readings)
-
-
 def check_other_table(model: CalibratedKinematics, new: Any) -> None:
-    """Raise InputError for rows of the model's own fit: they would count twice."""
-    if model.provenance is not None and model.provenance.table_sha256 == new.sha256:
+    """Raise InputError for rows of the model's own fit, or that it learnt from: they would count twice."""
+    if new.sha256 in [each.table_sha256 for each in (model.provenance, model.learnt) if each is not None]:
         used = int(rows_used_in_fit(model, new.q).sum())
         if used:
             what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"
@@ -304,18 +279,6 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     )
     far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
-
-
-def check_place(found: Registration) -> None:
-    """Raise MeasurementError if the rows leave open how the measuring device is turned."""
-    turn = float(found.frame_deviations[3:].max())
-    if turn > LARGEST_TURN_RAD:
-        raise MeasurementError.of(
-            "the new rows do not tell where the measuring device stands",
-            expected="markers that are not all on one line or at one place",
-            got=f"its turn is known to {degrees(turn):.2g} degrees only",
-            fix="measure poses in which several joints move",
-        )
 
 
 def warn_of_moved_markers(found: Registration, marker: str) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
@@ -62,6 +61,8 @@ from diffeo_calib.sensors.set_ups import mounted_of
 LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
+REGISTERED_AS = {PLACES.same_registered_m: "same", PLACES.remounted_m: "moved", PLACES.other_registered_m: "other"}
+"""The same in a registration."""
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
 Drift = Literal["tested", "none"]
@@ -288,33 +289,22 @@ def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
 
 def weighed(before: Before, marker: str) -> NewRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
-    if before.place is None:
-        return _weighed_by_ball(before, marker)
-    odds = before.place.odds
-    most = max(odds, key=lambda metres: odds[metres])
-    if marker == "other" or (marker == "evidence" and most == PLACES.other_registered_m):
-        own = before.place.registration.markers
-        if before.new_ball:
-            own = torch.cat([own[:-1], before.own_markers[-1:]])
-        return _rows(before, own, "other").with_weights()
-    if marker != "evidence":
-        return _rows(before, before.own_markers, marker).with_weights()
-    free = _rows(before, before.own_markers, "moved").with_weights()
-    same = free.changed(marker_deviation=MARKER_DEVIATIONS["same"])
-    return same.with_weights() if same.log_evidence >= free.log_evidence - UNMOVED_LOG_ODDS else free
-
-
-def _weighed_by_ball(before: Before, marker: str) -> NewRows:
-    """The same for rows that show a ball alone."""
-    own, ball = before.own_markers, before.known_ball
-    if ball is None:
+    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    if place is None and ball is None:
         return _rows(before, own, "same").with_weights()
-    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], ball[None]])}
+    other, known = own.clone(), slice(len(own) - before.new_ball)
+    if place is not None:
+        other[known] = place.registration.markers[known]
+    elif ball is not None:
+        other[-1] = ball
+    places = {"same": own, "moved": own, "other": other}
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
-    found = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
-    odds = {name: rows.log_evidence + UNMOVED_LOG_ODDS * (name == "same") for name, rows in found.items()}
-    return found[max(odds, key=lambda name: odds[name])]
+    if place is not None:
+        name = REGISTERED_AS[place.best.metres]
+        return _rows(before, places[name], name).with_weights()
+    every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
+    return max(every.items(), key=lambda each: each[1].log_evidence + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
 
 
 def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:

@@ -52,25 +52,22 @@ class Motion(NamedTuple):
 
 def motions(model: CalibratedKinematics, data: Measurements) -> list[Motion]:
     """The motions that explain most of a model's errors on rows of its markers, the best first; or none."""
-    if len(data) > MOST_ROWS:
-        data = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
-    laden, some = model.at_payloads(data.payload), data.rows(slice(None, None, -(-len(data) // MOST_EXPECTED)))
+    data, some = (data.rows(slice(None, None, -(-len(data) // most))) for most in (MOST_ROWS, MOST_EXPECTED))
+    laden = model.at_payloads(data.payload)
     mean = laden(data.q).detach()
-    errors = (data.points - mean).flatten(1)  # NaN where markers are hidden
     covariance = model.at_payloads(some.payload).map.posterior(some.q)[1]
-    expected = covariance.diagonal(dim1=1, dim2=2).mean(1).median()
-    if float(_mean_squares(errors).median()) < LEAST_EXCESS**2 * float(expected):
+    expected = float(covariance.diagonal(dim1=1, dim2=2).mean(1).median())
+
+    def size(errors: Tensor) -> float:
+        """Median of the mean squares of the rows' known coordinates."""
+        return float(errors.flatten(1).square().nanmean(1).median())
+
+    if size(data.points - mean) < LEAST_EXCESS**2 * expected:
         return []
-    found = [_device(mean, data.points), _marker(laden, data.q, errors)]
-    most = MOST_LEFT**2 * float(expected)
-    found = [each for each in found if float(_mean_squares(each.left.flatten(1)).median()) < most]
+    found = [_device(mean, data.points), _marker(laden, data.q, (data.points - mean).flatten(1))]
+    found = [each for each in found if size(each.left) < MOST_LEFT**2 * expected]
     least = max([LEAST_EXPLAINED, *(each.explained - AS_GOOD for each in found)])
     return sorted((each for each in found if each.explained >= least), key=lambda motion: -motion.explained)
-
-
-def _mean_squares(errors: Tensor) -> Tensor:
-    """Mean square (N,) of the known coordinates of each row (N, m)."""
-    return errors.square().nanmean(1)
 
 
 def _device(predicted: Tensor, measured: Tensor) -> Motion:
@@ -83,21 +80,14 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
 
 
 def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
-    points = _points(model)
-    old = model.bodies.at(points.points)
-    geodesic = model.map.geodesic.with_nominal(points)
+    points = FlangePoints(model.nominal, model.geometry.tool, same=True)
+    old, geodesic, seen = model.bodies.at(points.points), model.map.geodesic.with_nominal(points), ~errors.isnan()
     slopes = marker_slopes(geodesic, points, geodesic.linearise(q)) @ old.slopes  # (N, m, d)
-    seen = ~errors.isnan()
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = (old.stepped(step).points - old.points).norm(dim=1)
     what = f"{model.bodies.moved_words(len(shift))} on the flange"
     return Motion(what, float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
-
-
-def _points(model: CalibratedKinematics) -> FlangePoints:
-    """The nominal map of the model's points where they were found."""
-    return FlangePoints(model.nominal, model.geometry.tool, same=True)
 
 
 def _explained(before: Tensor, after: Tensor, unknowns: int) -> float:

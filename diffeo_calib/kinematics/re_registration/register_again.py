@@ -1,22 +1,16 @@
-"""`model.registered`: estimates under several priors, outliers, and the record of what was found.
+"""`model.registered`: estimates under several priors, the record of what was found, and what is learnt from the rows.
 
-Rows of a registration that contradict all others.
-
-Leaving rows J out lowers the quadratic form of the residuals by mu_J^T (K^-1)_JJ^-1 mu_J with K = V + S P S^T and
-mu = K^-1 r (r the residual minus S times the prior mean). Compared with what remains, this is an F test (externally
-studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then pairs, which may hide
-each other.
+A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one (0.3 m): the marginal
+likelihood of the rows chooses. The base may be anywhere.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from itertools import combinations
 from math import exp, log, nan
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,15 +23,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates, joins
-from diffeo_calib.kinematics.re_registration.estimate import (
-    Estimate,
-    Place,
-    Session,
-    anywhere,
-    at_old_places,
-    doubt,
-    estimate,
-)
+from diffeo_calib.kinematics.re_registration.estimate import Estimate, estimate
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
     Registration,
@@ -46,9 +32,8 @@ from diffeo_calib.kinematics.re_registration.registered_map import (
     turned,
     undetermined,
 )
-from diffeo_calib.kinematics.re_registration.session import Known, session_of
+from diffeo_calib.kinematics.re_registration.session import Place, Session
 from diffeo_calib.maps.noise import mean_block
-from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
@@ -90,15 +75,15 @@ def register_again(
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
-    learn = learn and found.part.session.same and open_by < LARGEST_M_RAD and not registration.doubtful
+    learn = learn and found.best.place.session.same and open_by < LARGEST_M_RAD and not registration.doubtful
     learn = learn and (model.registration is None or free == "both")  # what is held must be known
-    if not (learn and joins(fit, len(found.best.rows.residual))):
+    if not (learn and joins(fit, len(found.best.residual))):
         placed = moved(fit, registration.transform).inflated(found.best.inflation)
         return RegisteredMap(placed, registration), registration
-    learnt = moved(_learnt(fit, nominal, found), found.best.T)
-    own, old = robot_map(learnt), found.best.body.old
+    learnt = moved(_learnt(fit, nominal, found.best), registration.transform)
+    own, old = robot_map(learnt), found.best.place.body.old
     markers = own.geometry.tool + learnt.deformation.momenta.theta[own.geometry.slices["tool"]].view(-1, 3)
-    return learnt, replace(registration, transform=found.best.T, markers=markers, shift=markers - old)
+    return learnt, replace(registration, markers=markers, shift=markers - old)
 
 
 LARGEST_M_RAD = 0.03
@@ -107,27 +92,25 @@ STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
 """The first one is within 2 % of the optimum, the second within 0.1 %."""
 
 
-def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMap:
+def _learnt(fit: FittedMap, nominal: GeometryMap, found: Estimate) -> FittedMap:
     """The fit conditioned on the rows that took part, too, in its own frame, as if nothing but places had changed."""
-    session, best, odds = found.part.session, found.best, found.odds
-    metres = max(odds, key=lambda each: odds[each])
-    rows, P = best.rows, len(best.body.points)
-    free = rows.residual.new_full((3 * P,), (PLACES.same_m if metres == SAME_PLACE else metres) * session.body_free)
-    free[len(free) - 3 * session.ball :] = 0.0
+    place, session = found.place, found.place.session
+    framed, may = bool(session.free[0]), session.free[6:].view(len(place.body.points), -1).any(1)
+    metres = PLACES.same_m if found.metres == SAME_PLACE else found.metres
     new = NewDate(
-        markers=best.body.old if metres == SAME_PLACE else best.body.points,
+        markers=place.body.old if found.metres == SAME_PLACE else place.body.points,
         payload=session.nominal.payload,
-        q=session.q,
-        y=session.seen(best.T).flatten(1).nan_to_num(0.0),
-        noise=session.noise * doubt(best.weights)[:, None, None],
-        seen=rows.visible,
+        q=session.data.q,
+        y=session.seen(place.T).flatten(1).nan_to_num(0.0),
+        noise=session.noise,
+        seen=found.visible,
         shared=session.shared,
-        new_noise=_mean_noise(session, rows.visible),
-        frame=PLACES.found_m_rad * session.frame_free,
-        free=free,
+        new_noise=_mean_noise(found),
+        frame=PLACES.found_m_rad * framed,
+        free=metres * may.repeat_interleave(3).to(session.noise),
         centre=session.centre,
     )
-    problem, start = both_dates(fit, nominal, new, [], best.inflation)
+    problem, start = both_dates(fit, nominal, new, [], found.inflation)
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
@@ -135,16 +118,9 @@ def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMa
 
 
 class FoundPlace(NamedTuple):
-    """Result of a registration.
+    """Result of a registration: the most probable estimate, and the record."""
 
-    Args:
-        part: the rows that took part. best: the most probable estimate. odds: probability of each prior deviation of
-            the markers, m. registration: the record.
-    """
-
-    part: Known
     best: Estimate
-    odds: dict[float, float]
     registration: Registration
 
 
@@ -168,26 +144,28 @@ def find_place(
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
     nominal = nominal.under(some.payload)
     model = model.with_nominal(nominal)
-    every = session_of(model, nominal, lever, some, free, ball=ball)
-    priors = _priors(free, marker_std, known=every.known)
-    kept, dropped = torch.arange(len(some), device=some.q.device), []
+    session = Session.of(model, nominal, lever, some, free, ball=ball)
+    priors = _priors(free, marker_std, known=session.known)
+    kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        part = every.rows(kept)
+        part = session.rows(kept)
         starts = _starts(part, max(priors))
-        plain = _likeliest(_estimates(starts, priors, torch.ones_like(part.session.q[:, 0])))
-        worst = worst_rows(plain)
-        if not worst or len(dropped) + len(worst) > LARGEST_OUTLIER_PART * len(some):
+        found = {metres: _likeliest(starts, metres) for metres in priors}
+        odds = _odds(found)
+        best = found[max(odds, key=odds.__getitem__)]
+        worst = best.worst_rows()
+        if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
-        dropped += kept[worst].tolist()
+        outliers += kept[worst].tolist()
         kept = kept[[row for row in range(len(kept)) if row not in worst]]
-    before = _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if every.known else None
-    outliers = tuple(some.line_numbers[sorted(dropped)].tolist()) if dropped else ()
-    odds = {metres: odds for metres, odds in zip(priors, _odds(starts, priors), strict=True) if odds > 0}
-    weighed = list(zip(odds.values(), _estimates(starts, tuple(odds)), strict=True))
-    said = {"free": free, "outliers": outliers, "rms_before": before, "excess": scale(plain) ** 0.5}
-    said["same_place"] = odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None
-    best = max(weighed, key=lambda each: each[0])[1]
-    return FoundPlace(part, best, odds, _record(part, best, _mean(part.session, weighed, best), said))
+    said = {
+        "free": free,
+        "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
+        "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if session.known else None,
+        "excess": float(best.scale()[0]) ** 0.5,
+        "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
+    }
+    return FoundPlace(best, _record(best, said))
 
 
 def registration_rows(data: Any, model: Any) -> Measurements | None:
@@ -273,111 +251,70 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
     return MARKER_DEVIATIONS if known else (OTHER_MARKER,)
 
 
-def _starts(part: Known, widest: float) -> list[Place]:
+def _starts(session: Session, widest: float) -> list[Place]:
     """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
-    session, old, view, same = part
-    starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
-    needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    points = session.points[:, : session.points.shape[1] - session.ball]
-    shown = bool((~points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
-    free = shown and session.frame_free and session.body_free
-    if free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
-        starts.append(anywhere(session, old))
-    return starts
+    framed, points = bool(session.free[0]), session.data.points
+    starts = [session.at_old_places()] if session.known or not framed else []
+    may = session.free[6:].view(points.shape[1], -1).any(1)
+    shown = (~points.isnan()).any(2).any(0) | ~may  # else some marker could be anywhere
+    # as many coordinates as unknowns would fit any place
+    if framed and bool(may.any()) and bool(shown.all()) and widest >= OTHER_MARKER:
+        starts += [session.anywhere()] if len(known(points)) > len(session.free) else []
+    return [Place.of(session, *start) for start in starts]
 
 
-def _estimates(starts: list[Place], priors: tuple[float, ...], weights: Tensor | None = None) -> list[Estimate]:
-    """The likeliest estimate under every prior."""
-    found = []
-    for metres in priors:
-        usable = starts if metres >= OTHER_MARKER else starts[:1]
-        found.append(_likeliest([estimate(start, metres, weights) for start in usable]))
-    return found
+def _likeliest(starts: list[Place], metres: float) -> Estimate:
+    """The likeliest estimate under a prior."""
+    usable = starts if metres >= OTHER_MARKER else starts[:1]
+    return max((estimate(start, metres) for start in usable), key=Estimate.log_evidence)
 
 
-def _odds(starts: list[Place], priors: tuple[float, ...]) -> list[float]:
-    """Probabilities of the priors, with the weights of the rows that the widest one finds."""
-    weights = _estimates(starts, priors[-1:])[0].weights
-    found = zip(priors, _estimates(starts, priors, weights), strict=True)
-    logs = [each.log_evidence + UNMOVED_LOG_ODDS * (metres == SAME_PLACE) for metres, each in found]
-    odds = [exp(each - max(logs)) for each in logs]
-    likely = [each if each > NEGLIGIBLE_PROBABILITY * sum(odds) else 0.0 for each in odds]
-    return [each / sum(likely) for each in likely]
+def _odds(found: dict[float, Estimate]) -> dict[float, float]:
+    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
+    scale = max(1.0, float(found[max(found)].scale()[0]))
+    logs = {metres: each.log_evidence(scale) for metres, each in found.items()}
+    logs |= {SAME_PLACE: logs[SAME_PLACE] + UNMOVED_LOG_ODDS} if SAME_PLACE in logs else {}
+    odds = {metres: exp(each - max(logs.values())) for metres, each in logs.items()}
+    likely = {metres: each for metres, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+    return {metres: each / sum(likely.values()) for metres, each in likely.items()}
 
 
-def _likeliest(found: list[Estimate]) -> Estimate:
-    return max(found, key=lambda each: each.log_evidence)
-
-
-class _Mean(NamedTuple):
-    """Mean of estimates: frame, markers, and covariance and gain of both, in the frame of the fit."""
-
-    T: Tensor
-    body: Body
-    covariance: Tensor
-    gain: Tensor
-
-
-def _mean(session: Session, weighed: list[tuple[float, Estimate]], best: Estimate) -> _Mean:
-    """The mean of estimates by their odds, around the best one; their differences are part of the covariance."""
-    motions = [_motion(session, best.T, each.T) for _, each in weighed]
-    away = [
-        torch.cat([d, each.body.from_old - best.body.from_old]) for d, (_, each) in zip(motions, weighed, strict=True)
-    ]
-    step = torch.stack([w * d for d, (w, _) in zip(away, weighed, strict=True)]).sum(0)
-    covariance, gain = torch.zeros_like(session.known), best.gain.new_zeros(len(step), best.gain.shape[1])
-    for d, (w, each) in zip(away, weighed, strict=True):
-        own = session.known.clone()
-        own[each.free], own[:, each.free] = 0.0, 0.0
-        own[each.free[:, None], each.free] = each.covariance * best.inflation
-        covariance += w * (own + torch.outer(d - step, d - step))
-        gain[each.free] += w * each.gain
-    out = torch.block_diag(torch.eye(6, dtype=step.dtype, device=step.device), best.body.slopes)
-    T, body = session.moved(best.T, step[:6]), best.body.stepped(step[6:])
-    return _Mean(T, body, out @ covariance @ out.mT, out @ gain)
-
-
-def _motion(session: Session, T: Tensor, other: Tensor) -> Tensor:
-    """The small motion (6,) about the session's centre that leads from T to another transform."""
-    D = torch.linalg.inv(T) @ other
-    skewed = D[:3, :3] - D[:3, :3].mT
-    turn = 0.5 * torch.stack([skewed[2, 1], skewed[0, 2], skewed[1, 0]])
-    return torch.cat([D[:3, :3] @ session.centre + D[:3, 3] - session.centre, turn])
-
-
-def _record(part: Known, best: Estimate, mean: _Mean, said: dict[str, Any]) -> Registration:
+def _record(best: Estimate, said: dict[str, Any]) -> Registration:
     """Everything in the new measuring frame."""
-    session = part.session
-    R, count = mean.T[:3, :3], len(mean.covariance) - 6
-    turn = torch.block_diag(R, R, torch.eye(count, dtype=R.dtype, device=R.device))
-    covariance = turn @ mean.covariance @ turn.mT
+    place, session, body, free = best.place, best.place.session, best.place.body, best.free
+    R = place.T[:3, :3]
+    whole, gain = session.earlier.clone(), best.gain.new_zeros(len(session.free), best.gain.shape[1])
+    whole[free], whole[:, free], gain[free] = 0.0, 0.0, best.gain
+    whole[free[:, None], free] = best.covariance * best.inflation
+    out = torch.block_diag(R, R, body.slopes)
+    covariance = out @ whole @ out.mT
     covariance = 0.5 * (covariance + covariance.mT)
-    visible = best.rows.visible
-    usual = float(best.rows.V.diagonal()[visible.flatten()].median().sqrt())
-    arm = float((session.seen(mean.T) - session.centre).square().sum(-1).nanmean().sqrt())
-    geometry, rigid = session.nominal.geometry, mean.body.lever is not None
-    tips = geometry.on if len(geometry.on) == len(mean.body.points) else (geometry.chain.tip,) * len(mean.body.points)
+    usual = float((best.inflation * best.V.diagonal()[best.visible.flatten()].median()).sqrt())
+    arm = float((session.seen(place.T) - session.centre).square().sum(-1).nanmean().sqrt())
+    geometry, count = session.nominal.geometry, len(body.points)
+    tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
     return Registration(
-        transform=mean.T,
-        markers=mean.body.points,
-        lever=mean.body.lever,
+        transform=place.T,
+        markers=body.points,
+        lever=body.lever,
         same=session.same,
-        shift=mean.body.points - mean.body.old if part.known else None,
+        shift=body.points - body.old if session.known else None,
         covariance=covariance,
-        centre=R @ session.centre + mean.T[:3, 3],
-        q=session.q,
-        gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(best.inflation * _mean_noise(session, visible), R),
-        rms_after=_rms(best.rows.residual.masked_fill(~visible, nan).unflatten(1, (-1, 3))),
+        centre=R @ session.centre + place.T[:3, 3],
+        q=session.data.q,
+        gain=((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
+        noise=turned(best.inflation * _mean_noise(best), R),
+        rms_after=_rms(best.residual.masked_fill(~best.visible, nan).unflatten(1, (-1, 3))),
         left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
-        undetermined=undetermined(covariance, mean.body.points, arm, usual, tips, rigid=rigid),
+        undetermined=undetermined(covariance, body.points, arm, usual, tips, rigid=body.lever is not None),
         **said,
     )
 
 
-def _mean_noise(session: Session, visible: Tensor) -> Tensor:
+def _mean_noise(best: Estimate) -> Tensor:
     """Covariance (m, m) of a new measurement, m^2: that of the fit for points that no row shows."""
-    found, unseen = mean_block(session.noise, visible), ~visible.any(0)
+    session = best.place.session
+    found, unseen = mean_block(session.noise, best.visible), ~best.visible.any(0)
     both = unseen[:, None] & unseen
     return torch.where(both, session.fitted.new_noise, found) if bool(unseen.any()) else found
 
@@ -409,56 +346,3 @@ def warn_about(found: Registration, *, outliers: bool = True, excess: bool = Tru
         what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))
-
-
-PRIOR_FREEDOM = 10.0
-"""The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
-FALSE_ALARM_PROBABILITY = 0.001
-"""Probability that clean rows have an outlier."""
-MOST_PAIRS = 800
-
-
-def worst_rows(found: Estimate) -> list[int]:
-    """The one or two rows that contradict all others, or none."""
-    M = len(found.rows.residual)
-    for size in (1, 2):
-        sets = list(combinations(range(M), size))
-        if M - size < 3 or len(sets) > MOST_PAIRS:
-            continue
-        numbers = torch.tensor(sets, dtype=torch.int64, device=found.T.device)
-        falls = _falls(found, numbers)
-        chances = _chances(found, falls, numbers)
-        best = int(np.lexsort((-falls.numpy(force=True), chances))[0])  # of equal chances the largest fall
-        if chances[best] * len(sets) < FALSE_ALARM_PROBABILITY:
-            return list(sets[best])
-    return []
-
-
-def scale(found: Estimate) -> float:
-    """Square of the residuals' scale in units of what model and noise lead to expect."""
-    return float(_scales(found, found.T.new_zeros(()), found.T.new_zeros(()))[0])
-
-
-def _scales(found: Estimate, without: Tensor, coordinates: Tensor) -> tuple[Tensor, Tensor]:
-    """The same without parts of the quadratic form that belong to so many coordinates, and degrees of freedom."""
-    freedom = (found.rows.visible.sum() - coordinates - found.determined).clamp(min=0.0) + PRIOR_FREEDOM
-    return ((found.quadratic - without).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
-
-
-def _falls(found: Estimate, sets: Tensor) -> Tensor:
-    """Fall of the quadratic form without each set of rows: (K, size) -> (K,)."""
-    m = found.rows.residual.shape[1]
-    places = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-    blocks = found.factor.inverse[places[:, :, None], places[:, None, :]]
-    chosen = found.solved[places]
-    return (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
-
-
-def _chances(found: Estimate, falls: Tensor, sets: Tensor) -> np.ndarray:
-    """Probabilities (K,) of such falls by chance."""
-    from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    coordinates = found.rows.visible.sum(1).to(falls)[sets].sum(1)
-    variances, freedom = _scales(found, falls, coordinates)
-    ratios = falls / coordinates / variances
-    return fdtrc(*(values.numpy(force=True) for values in (coordinates, freedom, ratios)))

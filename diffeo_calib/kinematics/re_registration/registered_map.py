@@ -37,7 +37,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.fitted_map import NEGLIGIBLE_TURN_RAD, FittedMap
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
@@ -80,6 +80,7 @@ class Registration:
         excess: residuals in units of what model and noise lead to expect, outliers left out; about 1.
         same_place: probability that the markers stayed where they were; None if that was not asked.
         undetermined: sentences about directions that the rows hardly determine.
+        table_sha256: of the table, where the model learnt from its rows, see :attr:`Measurements.sha256`; else empty.
     """
 
     transform: Tensor
@@ -100,6 +101,7 @@ class Registration:
     excess: float
     same_place: float | None
     undetermined: tuple[str, ...]
+    table_sha256: str = ""
 
     @property
     def exchanged(self) -> tuple[int, ...]:
@@ -188,13 +190,11 @@ class RegisteredMap(FittedMap):
     ) -> Tensor:
         """That of the fit and of the registration."""
         points: Any = geodesic.spec.nominal
-        added = self._added(at, marker_slopes(geodesic, points, at))
-        fitted = self.fitted.with_second_order(self.fitted.covariance_at(at, directions))
-        return fitted + _along(directions, added)
+        return self.with_second_order(self._placed(at, directions, marker_slopes(geodesic, points, at)))
 
     def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Covariance of points of the body whose places on the flange are given; as :meth:`FittedMap.covariance_at`."""
-        return self.fitted.covariance_at(at, directions) + _along(directions, self._added(at, None))
+        return self._placed(at, directions, None)
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """That of the fit alone, without the registration's."""
@@ -202,40 +202,29 @@ class RegisteredMap(FittedMap):
 
     def joint_covariance(self, x: Tensor) -> Tensor:
         """That of the registration included, see :meth:`FittedMap.joint_covariance`."""
-        points, at = self.geodesic.linearised_value(x)
-        at, found = (
-            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1)),
-            self.registration,
-        )
-        S = self.place_slopes(x)
+        S, found = self.place_slopes(x), self.registration
+        at = self.geodesic.linearise(x)
+        at = at.projected(torch.eye(self.m, dtype=S.dtype, device=S.device).expand(len(x), -1, -1))
         cross = S @ (found.gain.to(S) @ self.fitted.covariance_between(self._rows, at))
         return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT
 
-    def _added(self, at: Linearisation, by_marker: Tensor | None) -> Tensor:
-        """Covariance that the registration adds: (M, m', m')."""
-        found, device = self.registration, self.deformation.x.device
-        shape = at.sensitivity.shape[:2]
-        points, centre = at.task[-1].points.view(shape[0], -1, 3), found.centre.to(device)
-        S = frame_slopes(points, centre)
+    def _placed(self, at: Linearisation, directions: Tensor | None, by_marker: Tensor | None) -> Tensor:
+        """As :meth:`FittedMap.covariance_at`, of points with these derivatives (M, m', 3 P) by the markers, or none."""
+        found, shape = self.registration, at.sensitivity.shape[:2]
+        points = at.task[-1].points.view(shape[0], -1, 3)
+        S = frame_slopes(points, found.centre.to(points))
         S = torch.cat([S, S.new_zeros(*shape, self.m) if by_marker is None else by_marker], -1)
         between = self.fitted.covariance_between(self._rows, at)  # (M P 3, rows m')
-        cross = S @ (found.gain.to(device) @ between).view(-1, *shape).movedim(0, 1)
-        curved = self._second_order((points - centre).square().sum(-1), with_markers=by_marker is not None)
-        return S @ found.covariance.to(device) @ S.mT - cross - cross.mT + torch.diag_embed(curved)
+        cross = S @ (found.gain.to(S) @ between).view(-1, *shape).movedim(0, 1)
+        added = S @ found.covariance.to(S) @ S.mT - cross - cross.mT
+        added = added if directions is None else directions @ added @ directions.mT
+        return self.fitted.covariance_at(at, directions) + added
 
-    def _second_order(self, squares: Tensor, *, with_markers: bool) -> Tensor:
-        """Variances (M, 3 P) of second order in turns w of the frame: w x (w x d) / 2 and w x (shift of the marker).
-
-        They are nothing, 1e-17 m^2, but where the rows leave a turn of many degrees undetermined.
-
-        Args:
-            squares: (M, P) squared distances d^2 from the centre, m^2. with_markers: whether the markers are uncertain.
-        """
-        variances = self.registration.covariance.diagonal()
-        turn = variances[3:6].sum()
-        shifts = variances[6:].view(-1, 3).sum(1) if with_markers else torch.zeros_like(turn)
-        total = 0.75 * float(turn) ** 2 * squares + (turn * shifts).to(squares)
-        return total.repeat_interleave(3, dim=1)
+    @property
+    def _turn_variance(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """With that of the frame, where its rows leave a turn of many degrees undetermined."""
+        own = float(self.registration.covariance.diagonal()[3:6].sum())
+        return self.fitted._turn_variance + own * (own > NEGLIGIBLE_TURN_RAD**2)
 
     def place_slopes(self, q: Tensor) -> Tensor:
         """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
@@ -252,11 +241,6 @@ class RegisteredMap(FittedMap):
     def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
         """That of the fit."""
         return self.fitted.conditional
-
-
-def _along(directions: Tensor | None, covariance: Tensor) -> Tensor:
-    """The covariance of linear functions (M, r, m) of coordinates with this covariance (M, m, m)."""
-    return covariance if directions is None else directions @ covariance @ directions.mT
 
 
 def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:
@@ -405,30 +389,12 @@ def _about_frame(covariance: Tensor, markers: Tensor, tip: str, limit: float) ->
 
 
 def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) -> str:
-    """A sentence about the directions with large deviations; empty if there are none."""
-    large = _large(covariance, limit)
-    if not large:
-        return ""
-    to = ", ".join(_number(degrees(s) if unit == "degrees" else 1e3 * s) for s, _ in large)
-    along = ", ".join(_direction(v) for _, v in large)
-    if len(large) == len(covariance):
-        return f"{what} is known to {to} {unit} only: {fix}"
-    return f"{what} {'about' if unit == 'degrees' else 'along'} {along} is known to {to} {unit} only: {fix}"
-
-
-def _large(covariance: Tensor, limit: float) -> list[tuple[float, Tensor]]:
-    """Deviations above the limit, and their directions, the largest first."""
+    """A sentence about the directions with large deviations, the largest first; empty if there are none."""
     values, vectors = torch.linalg.eigh(covariance)
-    deviations = values.clamp(min=0).sqrt()
-    return [(float(s), v) for s, v in zip(deviations.flip(0), vectors.mT.flip(0), strict=True) if float(s) > limit]
-
-
-def _number(value: float) -> str:
-    """Two digits."""
-    return f"{value:.2g}" if value < 99.5 else f"{round(value, -1):.0f}"
-
-
-def _direction(vector: Tensor) -> str:
-    """A unit vector, its largest component positive."""
-    signed = vector * vector[vector.abs().argmax()].sign()
-    return "(" + ", ".join(f"{value + 0.0:.2f}" for value in signed.tolist()) + ")"
+    pairs = zip(values.clamp(min=0).sqrt().flip(0).tolist(), vectors.mT.flip(0), strict=True)
+    large = [(s, v * v[v.abs().argmax()].sign()) for s, v in pairs if s > limit]
+    sizes = [degrees(s) if unit == "degrees" else 1e3 * s for s, _ in large]
+    to = ", ".join(f"{size:.2g}" if size < 99.5 else f"{round(size, -1):.0f}" for size in sizes)
+    along = ", ".join("(" + ", ".join(f"{value + 0.0:.2f}" for value in v.tolist()) + ")" for _, v in large)
+    along = "" if len(large) == len(covariance) else f" {'about' if unit == 'degrees' else 'along'} {along}"
+    return f"{what}{along} is known to {to} {unit} only: {fix}" if large else ""

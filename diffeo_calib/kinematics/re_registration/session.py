@@ -1,139 +1,232 @@
-"""Start of a registration: the rows as the fitted map sees them, and the markers before."""
+"""Rows of a new set-up as a fitted map sees them in its own frame, and the places where an estimate may begin."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, turned
-from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_poses
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.re_registration.usual_noise import noise_of_rows
+from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.bodies import Bodies, Body
-from diffeo_calib.measurements.pose_frames import kind_of_points
+from diffeo_calib.measurements.pose_frames import kind_of_points, own_blocks
+from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.placement import place, rigid_fit
+from diffeo_calib.robots.se3 import rotation, skew, transforms
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 LEAST_POINTS = 3
 """Points that determine where a frame is."""
+SMALL_STEP = 1e-2
+"""Below such a step of the markers, m and rad, C hardly changes, and the model's points follow to first order."""
 
 
-class Known(NamedTuple):
-    """The rows, the markers before with their view, and whether the measured markers may be these."""
-
-    session: Session
-    old: Body
-    view: View
-    known: bool
-
-    def rows(self, keep: Tensor) -> Known:
-        """The same with some of the rows."""
-        return self._replace(session=self.session.rows(keep), view=self.view.rows(keep))
-
-
-def session_of(
-    model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool = False
-) -> Known:
-    """The rows as the fitted map sees them, in its own frame; ``ball``: see :class:`Session`.
-
-    Raises:
-        InputError: the markers are to stay, but other ones were measured.
-        MeasurementError: fewer coordinates than unknowns.
-    """
-    before, fit = model.registration, model.unregistered
-    markers = _markers(fit, nominal) if before is None else before.markers
-    own, seen = Bodies(lever), data.bodies
-    known = own.kind == seen.kind and data.markers == len(markers)
-    if known:
-        data, seen = own.represented(data), own
-    if not known and free == "base":
-        what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
-        got = kind_of_points(data.markers, data.lever)
-        raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
-    old = seen.at(markers if known else seen.nowhere(data.markers, data.points))
-    same = known and (before is None or before.same)
-    size = 6 + len(old.from_old)
-    _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
-    zero = data.points.new_zeros(size, size)
-    rows = data.q, data.points, _noise(model, data, data.covariance, known=known), zero[0, :3], zero
-    by_fit = zero if not same else _by_fit(fit.with_nominal(nominal.typical), nominal, old, zero)
-    session = Session(fit, nominal, same, *rows, by_fit, _shared(data), free != "marker", free != "base", ball)
-    view = session.view(old)
-    T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
-    earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
-    if before is not None:
-        earlier = _earlier(before, old, centre, known=known)
-    seen = data.in_frames(torch.linalg.inv(T).expand(len(data), -1, -1))
-    own = None if data.covariance is None else turned(data.covariance, T[:3, :3].mT)
-    errors = {"noise": _noise(model, seen, own, known=known), "shared": _shared(seen)}
-    return Known(replace(session, **errors, centre=centre, known=earlier), old, view, known)
-
-
-def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
-    """The fitted markers (P, 3) in the tip's frame, m."""
-    shifts = fit.deformation.momenta.theta[nominal.geometry.slices["tool"]]
-    return nominal.geometry.tool + shifts.view(-1, 3)
-
-
-def _by_fit(fit: FittedMap, nominal: GeometryMap, old: Body, zero: Tensor) -> Tensor:
-    """Covariance (6 + d, 6 + d) of the body's place by the fit."""
-    part = nominal.geometry.slices["tool"]
-    numbers = torch.arange(part.start, part.stop, device=zero.device)
-    to = torch.linalg.pinv(old.slopes)
-    found = zero.clone()
-    found[6:, 6:] = to @ fit.parameter_covariance(numbers) @ to.mT
-    return found
-
-
-def _shared(data: Measurements) -> Tensor:
-    """(M, 3 P, c) effects of errors of unit variance that rows share, of lenses and boards, m."""
-    found = [own.slopes for own in data.shared_errors()]
-    return torch.cat(found, 2) if found else data.points.new_zeros(len(data), 3 * data.markers, 0)
-
-
-def _noise(model: FittedMap, data: Measurements, own: Tensor | None, *, known: bool) -> Tensor:
-    """Covariance of rows (M, 3 P, 3 P) in the frame of the fit, m^2; hidden markers carry no information.
-
-    It is that of the fit, or their own where it is larger. Poses of the fit turn and stand as each row has them. For
-    another number of markers each has the mean covariance of the fitted ones.
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Rows of a new set-up, seen by a fitted map in its own frame.
 
     Args:
-        model: as it stands now. data: rows in the frame of the fit. own: (M, 3 P, 3 P) what is known of them, m^2.
-        known: whether they may show the bodies of the fit.
+        model: the map, placed anew before or not. nominal: that of the fit, under the payloads of the rows.
+        data: M rows that show P points of the body. old: the body where the model has it, or at the tip.
+        known: whether it may be there. free: (6 + d,) boolean, which unknowns of frame and body may have moved.
     """
-    new_noise, size, fit = model.new_noise, 3 * data.markers, model.unregistered
-    if len(new_noise) != size:
-        blocks = new_noise.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2)  # (3, 3, P)
-        new_noise = torch.block_diag(*[blocks.mean(-1)] * data.markers)
-    by_row = noise_of_poses(fit, data) if known else None
-    inflation = model.new_noise.trace() / fit.new_noise.trace()
-    total = new_noise.expand(len(data), size, size) if by_row is None else inflation * by_row
-    total = total if own is None else larger(total, own)
-    return without_hidden(total, data.visible.repeat_interleave(3, 1))
+
+    model: FittedMap
+    nominal: GeometryMap
+    data: Measurements
+    old: Body
+    known: bool
+    free: Tensor
+
+    @classmethod
+    def of(
+        cls, model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool
+    ) -> Session:
+        """The rows beside a model; arguments as of :func:`find_place`.
+
+        Raises:
+            InputError: the markers are to stay, but other ones were measured.
+            MeasurementError: no more coordinates than unknowns without a prior.
+        """
+        before, theta = model.registration, model.unregistered.deformation.momenta.theta
+        markers = nominal.geometry.tool + theta[nominal.geometry.slices["tool"]].view(-1, 3)
+        markers = markers if before is None else before.markers
+        own, seen = Bodies(lever), data.bodies
+        known = own.kind == seen.kind and data.markers == len(markers)
+        if known:
+            data, seen = own.represented(data), own
+        elif free == "base":
+            what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
+            got = kind_of_points(data.markers, data.lever)
+            raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
+        old = seen.at(markers if known else seen.nowhere(data.markers, data.points))
+        numbers = torch.arange(6 + len(old.from_old), device=data.q.device)
+        may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
+        framed = free != "marker"
+        _check_enough(data, 6 * framed + (0 if known else len(numbers) - 6), framed=framed)
+        return cls(model, nominal, data, old, known, may)
+
+    def rows(self, keep: Tensor) -> Session:
+        """The session with some of its rows."""
+        return replace(self, nominal=self.nominal.rows(keep), data=self.data.rows(keep))
+
+    @property
+    def fitted(self) -> FittedMap:
+        """The map of the fit."""
+        return self.model.unregistered
+
+    @property
+    def same(self) -> bool:
+        """Whether the markers are those of the fit."""
+        before = self.model.registration
+        return self.known and (before is None or before.same)
+
+    def seen(self, T: Tensor) -> Tensor:
+        """The measured points in the frame of the map, T^-1 y, m; NaN where hidden."""
+        return (self.data.points - T[:3, 3]) @ T[:3, :3]
+
+    @cached_property
+    def rough(self) -> Tensor:
+        """(4, 4) from the frame of the map to the measuring frame, in closed form, m."""
+        return (self.at_old_places() if self.known else self.anywhere())[0]
+
+    @cached_property
+    def centre(self) -> Tensor:
+        """(3,) about which the frame turns, m."""
+        return self.seen(self.rough).flatten(0, 1).nanmean(0)
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """(M, 3 P, 3 P) covariance of the rows, m^2, without information where hidden.
+
+        For another number of markers each has the mean covariance of the fitted ones.
+        """
+        block, fit, size = self.model.new_noise, self.fitted, 3 * self.data.markers
+        factor = float(block.trace() / fit.new_noise.trace()) if self.known else None
+        if len(block) != size:
+            block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * self.data.markers)
+        total = noise_of_rows(fit, self.data, self.rough, block, factor)
+        return without_hidden(total, self.data.visible.repeat_interleave(3, 1))
+
+    @cached_property
+    def shared(self) -> Tensor:
+        """(M, 3 P, c) effects of errors of unit variance that rows share, of lenses and boards, m."""
+        there = self.data.in_frames(torch.linalg.inv(self.rough).expand(len(self.data), -1, -1))
+        return torch.cat(
+            [self.noise.new_zeros(*self.noise.shape[:2], 0), *(e.slopes for e in there.shared_errors())], 2
+        )
+
+    @cached_property
+    def earlier(self) -> Tensor:
+        """(6 + d, 6 + d) covariance of frame and body by an earlier registration; zero without one."""
+        before, found = self.model.registration, self.noise.new_zeros(len(self.free), len(self.free))
+        if before is None:
+            return found
+        arms = torch.eye(6, dtype=found.dtype, device=found.device)
+        arms[:3, 3:] = -skew(self.centre - before.centre)
+        if self.known:
+            to = torch.block_diag(arms, torch.linalg.pinv(self.old.slopes))
+            return to @ before.covariance @ to.mT
+        found[:6, :6] = arms @ before.covariance[:6, :6] @ arms.mT
+        return found
+
+    @cached_property
+    def by_fit(self) -> Tensor:
+        """(6 + d, 6 + d) covariance of the body's old place by the fit, a part of C; zero elsewhere."""
+        found = self.noise.new_zeros(len(self.free), len(self.free))
+        if self.same:
+            part = self.nominal.geometry.slices["tool"]
+            to = torch.linalg.pinv(self.old.slopes)
+            numbers = torch.arange(part.start, part.stop, device=found.device)
+            fit = self.fitted.with_nominal(self.nominal.typical)
+            found[6:, 6:] = to @ fit.parameter_covariance(numbers) @ to.mT
+        return found
+
+    def points_of(self, body: Body) -> FlangePoints:
+        """The nominal map of a body's points at the rows."""
+        return FlangePoints(self.nominal, body.points, same=self.same)
+
+    def at_old_places(self) -> tuple[Tensor, Body]:
+        """The body where it was, the frame (4, 4) in closed form, m."""
+        T = torch.eye(4, dtype=self.data.q.dtype, device=self.data.q.device)
+        if bool(self.free[0]):
+            model = self.fitted.geodesic.with_nominal(self.points_of(self.old))
+            T = rigid_fit(model(self.data.q).view(-1, 3), self.data.points.flatten(0, 1))
+        return T, self.old
+
+    def anywhere(self) -> tuple[Tensor, Body]:
+        """Frame (4, 4) and body in closed form, m; what never moves stays."""
+        own, points = self.nominal.geometry, self.data.points
+        tips = list(dict.fromkeys(own.on)) if len(own.on) == points.shape[1] else [own.on[0]]
+        corners = tool_points(tool_transform(None).to(points.device)).repeat(len(tips), 1)
+        marks = FlangePoints(self.nominal, corners, on=tuple(tip for tip in tips for _ in range(3)))
+        poses = poses_from_marks(self.fitted.geodesic.with_nominal(marks)(self.data.q).view(-1, 3, 3), TOOL_LEVER)
+        carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * points.shape[1]
+        found = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
+        shown = (~points.isnan()).any(2).any(0)
+        return found.base, self.old.at(torch.where(shown[:, None], found.tool, self.old.old))
 
 
-def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) -> Tensor:
-    """Covariance (6 + d, 6 + d) of frame, about another centre, and body from an earlier registration."""
-    arms = torch.eye(6, dtype=centre.dtype, device=centre.device)
-    arms[:3, 3:] = -skew(centre - before.centre)
-    if known:
-        to = torch.block_diag(arms, torch.linalg.pinv(old.slopes))
-        return to @ before.covariance @ to.mT
-    covariance = centre.new_zeros(6 + len(old.from_old), 6 + len(old.from_old))
-    covariance[:6, :6] = arms @ before.covariance[:6, :6] @ arms.mT
-    return covariance
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A frame T (4, 4), m, and a body, with the rows as the model sees them from there.
+
+    Args:
+        points: (M, P, 3) of the model, m. slopes: (M, 3 P, d) of these by the body.
+        C: (3 P M, 3 P M) their posterior covariance by the fit. exact: whether no step was to first order.
+    """
+
+    session: Session
+    T: Tensor
+    body: Body
+    points: Tensor
+    slopes: Tensor
+    C: Tensor
+    exact: bool = True
+
+    @classmethod
+    def of(cls, session: Session, T: Tensor, body: Body, covariance: Tensor | None = None) -> Place:
+        """The rows from there; the covariance C is passed if it is known already."""
+        points = session.points_of(body)
+        deformation = session.fitted.geodesic.with_nominal(points)
+        value, at = deformation.linearised_value(session.data.q)
+        slopes = marker_slopes(deformation, points, at) @ body.slopes
+        C = session.fitted.covariance_between(at) if covariance is None else covariance
+        return cls(session, T, body, value.unflatten(1, (-1, 3)), slopes, C)
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """(M, 3 P) m; zero where hidden."""
+        return (self.session.seen(self.T) - self.points).nan_to_num(0.0).flatten(1)
+
+    @cached_property
+    def by_unknowns(self) -> Tensor:
+        """(M, 3 P, 6 + d) derivatives by frame and body."""
+        return torch.cat([frame_slopes(self.points, self.session.centre), self.slopes], -1)
+
+    def stepped(self, step: Tensor) -> Place:
+        """After a step (6 + d,) of frame and body."""
+        turn, centre, moved = rotation(step[3:6]), self.session.centre, float(step[6:].abs().max())
+        T = self.T @ transforms(turn, centre + step[:3] - turn @ centre)
+        body = self.body.stepped(step[6:])
+        if moved > SMALL_STEP:
+            return Place.of(self.session, T, body)
+        points = self.points + (self.slopes @ step[6:]).view_as(self.points)
+        return replace(self, T=T, body=body, points=points, exact=self.exact and moved == 0.0)
 
 
-def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
+def _check_enough(data: Measurements, unknowns: int, *, framed: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
     each = data.bodies.numbers * float(data.seen_bodies.sum()) / len(data)
-    points = -(-LEAST_POINTS // data.markers) if frame_free else 1
+    points = -(-LEAST_POINTS // data.markers) if framed else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"

@@ -6,37 +6,36 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.re_registration.registered_map import turned
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 
 
-def usual_noise(fitted: FittedMap, new: Measurements) -> Tensor:
-    """(M, m, m) noise of new rows in the model's frame, m^2: that of usual rows of the fit."""
-    by_row = noise_of_poses(fitted, new)
-    if by_row is not None:
-        return by_row
-    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
-    return block.expand(len(new), -1, -1)
-
-
-def noise_of_poses(fitted: FittedMap, new: Measurements) -> Tensor | None:
-    """(M, m, m) noise of new poses in the model's frame, m^2; None where the fit or the rows have other bodies.
+def noise_of_rows(fitted: FittedMap, new: Measurements, T: Tensor, block: Tensor, factor: float | None) -> Tensor:
+    """(M, m, m) noise of new rows in the model's frame, m^2: a block, of poses by row; their own where it is larger.
 
     Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
     each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
+
+    Args:
+        fitted: a fit. new: the rows. T: (4, 4) from the frame of the model to theirs, m. block: (m, m) of a row, m^2.
+        factor: on the variances of poses of the fit; None where the fit or the rows have other bodies.
     """
-    bodies, whole = new.bodies, fitted.slopes is None and bool(fitted.noise.visible.all())
-    own, old = bodies.modes(new), bodies.modes_of(new, fitted.measured().unflatten(1, (-1, 3))) if whole else None
-    if own is None or old is None:
-        return None
-    blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
-    to_modes = torch.linalg.pinv(old)
-    sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
-    eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
-    apart = eye - old @ to_modes
-    slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
-    return block_diagonal((own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye)
+    there = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
+    bodies, total = new.bodies, block.expand(len(new), -1, -1)
+    known = factor is not None and fitted.slopes is None and bool(fitted.noise.visible.all())
+    own, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if known else None
+    if own is not None and old is not None:
+        blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
+        to_modes = torch.linalg.pinv(old)
+        sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
+        eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
+        apart = eye - old @ to_modes
+        slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
+        each = (own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye
+        total = factor * block_diagonal(each)
+    return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
 
 
 def typical_noise(noise: Noise) -> Tensor:
@@ -47,9 +46,8 @@ def typical_noise(noise: Noise) -> Tensor:
     whole = noise.visible.all(1)
     if bool(whole.any()):
         return _of_median_size(noise.covariance[whole])
-    own = noise.covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).diagonal(dim1=1, dim2=3).movedim(-1, 0)
-    seen = noise.visible[:, ::3].T  # (P, N)
-    return torch.block_diag(*[_of_median_size(blocks[rows]) for blocks, rows in zip(own, seen, strict=True)])
+    own, seen = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
+    return torch.block_diag(*[_of_median_size(own[seen[:, k], k]) for k in range(seen.shape[1])])
 
 
 def _of_median_size(blocks: Tensor) -> Tensor:
