@@ -139,18 +139,6 @@ class DataConditional(Conditional):
         """(G + R)^-1 target: (N, m) -> (N, m)."""
         return self.solve(target[:, :, None])[:, :, 0]
 
-    def inverse_blocks(self, rows: int) -> Tensor:
-        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m); only where there is a factor of G + R."""
-        raise NotImplementedError
-
-    def left_out(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors (N, m) of every configuration predicted by all others, [(G + R)^-1]_ii^-1 mu_i, and their covariance.
-
-        The covariance (N, m, m) holds the noise of the configuration itself.
-        """
-        own = torch.linalg.inv(self.inverse_blocks(len(target)))
-        return (own @ self.mu(target)[:, :, None])[:, :, 0], own
-
     def momenta(self, target: Tensor) -> Momenta:
         """mu transported back to time 0."""
         return self.linearisation.momenta(self.mu(target))
@@ -159,19 +147,6 @@ class DataConditional(Conditional):
     def size(self) -> int:
         """N m."""
         return self.linearisation.sensitivity.shape[:2].numel()
-
-    def posterior(self, at: Linearisation) -> Tensor:
-        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
-        cross = self.linearisation.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
-        return at.own_blocks() - self.explained(cross)
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
-        both = [at] if other is None else [at, other]
-        cross = torch.cat([self.linearisation.gram(points) for points in both], 1)
-        explained = self.explained(cross.T[None])[0]
-        split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
-        return at.gram(other) - explained[: split or None, split:]
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""

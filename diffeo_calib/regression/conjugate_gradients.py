@@ -203,6 +203,19 @@ class ConjugateGradientRegression(DataConditional):
             )
         return x
 
+    def posterior(self, at: Linearisation) -> Tensor:
+        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
+        cross = self.linearisation.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
+        return at.own_blocks() - self.explained(cross)
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
+        both = [at] if other is None else [at, other]
+        cross = torch.cat([self.linearisation.gram(points) for points in both], 1)
+        explained = self.explained(cross.T[None])[0]
+        split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
+        return at.gram(other) - explained[: split or None, split:]
+
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T; for large problems with the preconditioner's matrix in place of G + R.
 

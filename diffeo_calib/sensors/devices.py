@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
@@ -31,8 +31,9 @@ OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
-FEWEST_PER_DEVICE = 8
-"""Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
+FEWEST_PER_DEVICE, ENOUGH_PER_DEVICE = 4, 8
+"""Rows of each device, and those that also tell something else: a plane, a fixed point or a camera takes three to six
+numbers of them."""
 
 
 class Effect(NamedTuple):
@@ -316,12 +317,15 @@ class ReadPoints(Observation):
 
 
 def check_devices(data: Readings) -> None:
-    """Refuse devices with too few rows to be placed."""
-    short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
-    if short:
-        fix = "check the names in these rows, measure more rows of them, or leave them out"
-        expected = f"at least {FEWEST_PER_DEVICE} rows of each device"
-        raise MeasurementError.of("`readings`", expected=expected, got=few(short), fix=fix)
+    """Refuse devices with too few rows to be placed, and warn of those whose rows tell little else."""
+    fix = "check the names in these rows, measure more rows of them, or leave them out"
+    for fewest in (FEWEST_PER_DEVICE, ENOUGH_PER_DEVICE):
+        short = rare_names(data.device_names, data.lines.tolist(), fewest)
+        text = sentence("`readings`", expected=f"at least {fewest} rows of each device", got=few(short), fix=fix)
+        if short and fewest == FEWEST_PER_DEVICE:
+            raise MeasurementError(text)
+        if short:
+            warn_user(text)
 
 
 def least_squares(matrix: Tensor, target: Tensor) -> Tensor:

@@ -120,7 +120,7 @@ def test_what_is_refused() -> None:
     devices = placed(data, points(data.q))
     with pytest.raises(MeasurementError, match="expected distances of left, right, got heights of left, right"):
         devices.errors(readings("height"), points(Q)[:, 0])
-    with pytest.raises(MeasurementError, match="at least 8 rows of each device, got 'right' in 3 rows"):
+    with pytest.raises(MeasurementError, match="at least 4 rows of each device, got 'right' in 3 rows"):
         dc.evaluate(points, data.rows([*range(0, 60, 2), 1, 3, 5]))
     with pytest.raises(MeasurementError, match="`focal`"):
         dc.Readings.images(Q, torch.zeros(ROWS, 2), focal=(0.0, 1.0), centre=(0.0, 0.0))

@@ -17,7 +17,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
-from diffeo_calib.regression.cholesky import factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
 from diffeo_calib.regression.control_points import ControlPointRegression
@@ -103,7 +103,7 @@ def test_same_covariance_as_the_cholesky_factor(
 ) -> None:
     at = deformed(problem)
     queries = at.linearise(uniform(6, 2, seed=20))
-    expected = factorise(at.linearise(), problem.noise).covariance(queries)
+    expected = CholeskyRegression(at.linearise(), problem.noise).covariance(queries)
     actual = way(problem, at).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()) + 1e-9)
 
@@ -117,7 +117,7 @@ def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatc
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
-    expected = factorise(data, problem.noise).covariance(queries)
+    expected = CholeskyRegression(data, problem.noise).covariance(queries)
     monkeypatch.setattr(iterative, "MAX_EXACT_COORDINATES", 0)
     monkeypatch.setattr(iterative, "NEGLIGIBLE_VARIANCE_RATIO", 1e-9)
     scale = float(expected.abs().max())
@@ -204,7 +204,7 @@ def test_features_give_every_covariance(problem: Problem) -> None:
     at = deformed(problem)
     queries = at.linearise(uniform(6, problem.x.shape[1], seed=8))
     for conditional in (
-        choose.condition_for_covariances(at.linearise(), problem.noise),
+        choose.condition(at.linearise(), problem.noise),
         ControlPointRegression(at, problem.x, problem.noise),
     ):
         values, signs = conditional.features(queries)

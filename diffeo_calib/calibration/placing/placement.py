@@ -25,7 +25,7 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.regression.choose import condition
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
@@ -288,6 +288,6 @@ def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:
     """Posterior covariance (c, c) of all shifts."""
     at = fitted.geodesic.linearise(fitted.data)
     at = at if fitted.slopes is None else at.projected(fitted.slopes)
-    alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
+    alone = condition(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
     known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
     return torch.linalg.inv(known + torch.eye(len(known), dtype=known.dtype, device=known.device))

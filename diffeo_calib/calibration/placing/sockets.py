@@ -259,7 +259,7 @@ class SocketDevices(DeviceSet):
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
             index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
-            ((errors, _),) = process.left_out([index])
+            errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
             predicted = data.y[rows, -3:] - errors.view(-1, 3)

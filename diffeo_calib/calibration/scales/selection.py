@@ -21,8 +21,8 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.process.factor import Factor
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
+from diffeo_calib.regression.factor import Factor
 
 MESHING_LENGTHSCALE_RAD = 0.22
 """Default length scale of the transmission kernels on a circle: meshing of a reduction gear."""

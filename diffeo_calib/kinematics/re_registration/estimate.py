@@ -38,7 +38,7 @@ from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.bodies import Body
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
-from diffeo_calib.process.factor import Factor
+from diffeo_calib.regression.factor import Factor
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
