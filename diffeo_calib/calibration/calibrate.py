@@ -183,7 +183,9 @@ def calibrate(
 def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float | None]:
     """Lengths against the robot's description, and by how much one that is too improbable moves points, m."""
     data = chosen.data
-    found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(data))
+    found = lengths(
+        data, chosen.selection.scales, lambda: [one for own in placed.placement for one in own.doubts(data)]
+    )
     worst = doubtful(found)
     if worst is None:
         return found, None
@@ -193,8 +195,9 @@ def _lengths(placed: Placed, chosen: ChosenScales) -> tuple[list[Length], float 
 
 def _change(placed: Placed, chosen: ChosenScales) -> str | None:
     """A sentence about what changed during the measurements."""
-    numbers, data, placement = placed.data.line_numbers, chosen.data, placed.placement
-    return change_during(numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(data))
+    data, sets = chosen.data, placed.placement
+    around = data, chosen.selection.scales, chosen.left_out
+    return change_during(placed.data.line_numbers, *around, lambda: [one for own in sets for one in own.changes(data)])
 
 
 def _warn_of_what_is_open(robot: Tree, placed: Placed, data: TangentData) -> None:

@@ -384,7 +384,7 @@ class CampaignModel:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        return Around(data.rows(index), lambda: placed.placement.changes(data), index)
+        return Around(data.rows(index), lambda: [one for own in placed.placement for one in own.changes(data)], index)
 
     def _errors(self) -> tuple[Numbers, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.

@@ -105,21 +105,11 @@ class Hyperparameters:
     other_noise: Tensor | None = None
 
     def joint_kernel(self, space: Space) -> Kernel:
-        """K_V on the joint space."""
-        return self.transmission_kernel(space) + self.coupled_kernel(space)
-
-    def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l."""
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, TRANSMISSION_PROFILE)
-
-    def coupled_kernel(self, space: Space) -> Kernel:
-        """diag_l c_l^2 k_all."""
-        return RadialKernel(
-            COUPLED_PROFILE,
-            lengthscale=self.coupled_lengthscale,
-            variance=self.coupled_amplitude**2,
-            periodic=space.periodic,
-        )
+        """K_V on the joint space: diag_l a_l^2 k_l + c_l^2 k_all."""
+        lengthscale, variance = self.coupled_lengthscale, self.coupled_amplitude**2
+        coupled = RadialKernel(COUPLED_PROFILE, lengthscale=lengthscale, variance=variance, periodic=space.periodic)
+        own = self.transmission_lengthscale, self.transmission_amplitude**2
+        return PerJoint(*own, space, TRANSMISSION_PROFILE) + coupled
 
     def task_kernel(self) -> Kernel:
         """K_W on R^3."""

@@ -8,7 +8,7 @@ the covariance of the fields, it is
     D = S(x) - F(x, data) (F + R)^-1 S
 
 (Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which
-nothing large cancels. Shifts that rows share (:class:`Noise`) are parameters, too, which new rows do not have.
+nothing large cancels. Shifts that rows share (:class:`Noise`) are parameters, too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import DataConditional, FeatureConditional, Features, diagonal_blocks
+from diffeo_calib.regression.conditional import (
+    DataConditional,
+    FeatureConditional,
+    Features,
+    diagonal_blocks,
+    of_parameters,
+)
 from diffeo_calib.regression.factor import Factor
 
 
@@ -41,11 +47,12 @@ class CholeskyRegression(FeatureConditional, DataConditional):
 
     def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
         super().__init__(linearisation)
-        visible, self.shifts = noise.visible, noise.shared.shape[2]
+        visible, shared = noise.visible, noise.shared
         self.seen = slice(None) if bool(visible.all()) else visible.flatten().nonzero()[:, 0]
         self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
         matrix = noise.own.add_to(linearisation.fields.gram())
-        slopes = torch.cat([linearisation.sensitivity * self.deviations, noise.shared], 2).flatten(0, 1)
+        slopes = torch.cat([linearisation.sensitivity * self.deviations, shared], 2).flatten(0, 1)
+        self.deviations = torch.cat([self.deviations, shared.new_ones(shared.shape[2])])
         self.factor = Factor.of(matrix[self.seen][:, self.seen], slopes[self.seen])
 
     def solve(self, values: Tensor) -> Tensor:
@@ -56,7 +63,7 @@ class CholeskyRegression(FeatureConditional, DataConditional):
         """Fields by mu, transported back to time 0; parameters apart, since S^T mu would lose their digits."""
         mu, shift = self.factor.solved(target.flatten()[self.seen, None])
         found = self.linearisation.fields.momenta(self._spread(mu[:, 0]).view_as(target))
-        return replace(found, theta=self.deviations * shift[: len(self.deviations), 0])
+        return replace(found, theta=(self.deviations * shift[:, 0])[: len(self.linearisation.spec.prior_variance)])
 
     def of_white(self, values: Tensor) -> Tensor:
         """C values with C C^T = (G + R)^-1: (S,) -> (N m,)."""
@@ -79,17 +86,9 @@ class CholeskyRegression(FeatureConditional, DataConditional):
         cross = self.linearisation.fields.gram(at.fields).T[:, self.seen]
         with large_work(cross.numel()):
             known = torch.linalg.solve_triangular(L.T, cross, upper=True, left=False)  # (M r, S)
-        scaled = at.sensitivity.flatten(0, 1) * self.deviations
-        unknown = torch.nn.functional.pad(scaled, (0, self.shifts)) - known @ W  # D Lambda^-1/2
+        unknown = of_parameters(at, len(B)).flatten(0, 1) * self.deviations - known @ W  # D Lambda^-1/2
         unknown = torch.linalg.solve_triangular(B.T, unknown, upper=True, left=False)
         return Features.of((known.T, -1), (unknown.T, 1))
-
-    def shift_features(self) -> Tensor:
-        """Posterior of the shifts."""
-        B = self.factor.B
-        own = torch.eye(len(B), dtype=B.dtype, device=B.device)[:, len(B) - self.shifts :]
-        left = torch.linalg.solve_triangular(B, own, upper=False)
-        return torch.cat([left.new_zeros(len(self.factor.L), self.shifts), left])
 
     def _spread(self, flat: Tensor) -> Tensor:
         """Values (S, ...) of what was measured as those of all, zero elsewhere: (N m, ...)."""

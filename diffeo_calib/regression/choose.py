@@ -12,10 +12,9 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import Conditional, DataConditional
+from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
 from diffeo_calib.regression.control_points import BLOCK_ENTRIES, ControlPointRegression
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 LinearSolver = Literal["auto", "cholesky", "cg"]
 
@@ -42,35 +41,6 @@ def condition(
     if method == "cholesky":
         return CholeskyRegression(linearisation, noise)
     return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
-
-
-def condition_fit(
-    deformation: GeodesicDeformation,
-    noise: Noise,
-    data: Tensor | None = None,
-    workspace: Tensor | None = None,
-    slopes: Tensor | None = None,
-) -> Conditional:
-    """The fields around fitted flows, conditioned on the data, for covariances.
-
-    Args:
-        deformation: the flows. noise: R.
-        data: (N, n) configurations of the measurements; None if they are the control points.
-        workspace: (M, n) configurations over which rigid motions are left out; None for none.
-        slopes: (N, r, m) linear functionals that were measured; None for all coordinates.
-
-    Raises:
-        InputError: the method needs more memory than is free.
-    """
-    if data is None:
-        at = deformation.linearise()
-        at = at if slopes is None else at.projected(slopes)
-        found: Conditional = condition(at, noise)
-    else:
-        found = condition_controls(deformation, data, noise, slopes)
-    if workspace is None:
-        return found
-    return WithoutRigidMotions(found, deformation.linearise(workspace), deformation.spec.nominal.places[:6])
 
 
 def condition_controls(

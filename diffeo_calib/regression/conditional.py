@@ -39,15 +39,11 @@ class Features(NamedTuple):
 
 
 class Conditional(ABC):
-    """The Gaussian conditional of one linearisation on the data."""
+    """The Gaussian conditional of one linearisation on the data.
 
-    @abstractmethod
-    def momenta(self, target: Tensor) -> Momenta:
-        """Posterior mode of b, p, theta.
-
-        Args:
-            target: (N, m) measured minus linearised model at zero fields, m.
-        """
+    Shifts that rows of the data share are parameters of unit variance after those of the nominal map. Linearisations
+    that take part in some have columns for all; others have none.
+    """
 
     @property
     @abstractmethod
@@ -100,10 +96,6 @@ class Conditional(ABC):
         what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
         raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
 
-    def shift_features(self) -> Tensor:
-        """The same features of the shifts that rows share: (k, c)."""
-        raise InputError.of("features of shared shifts", fix="calibrate with fewer control points (`controls=200`)")
-
 
 class FeatureConditional(Conditional):
     """A conditional whose covariances are those of its :class:`Features`: nothing large cancels in them."""
@@ -140,7 +132,11 @@ class DataConditional(Conditional):
         return self.solve(target[:, :, None])[:, :, 0]
 
     def momenta(self, target: Tensor) -> Momenta:
-        """mu transported back to time 0."""
+        """Posterior mode of b, p, theta: mu transported back to time 0.
+
+        Args:
+            target: (N, m) measured minus linearised model at zero fields, m.
+        """
         return self.linearisation.momenta(self.mu(target))
 
     @property
@@ -152,6 +148,11 @@ class DataConditional(Conditional):
         """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""
         columns = cross.flatten(0, 1).T.reshape(*self.linearisation.sensitivity.shape[:2], -1)  # (N, m, M r)
         return cross @ self.solve(columns).flatten(0, 1).view(-1, *cross.shape[:2]).movedim(0, 1)
+
+
+def of_parameters(at: Linearisation, count: int) -> Tensor:
+    """Derivatives (M, r, count) by all parameters, zero by shifts of which a linearisation says nothing."""
+    return torch.nn.functional.pad(at.sensitivity, (0, count - at.sensitivity.shape[2]))
 
 
 def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,6 @@ from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
 from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
@@ -43,7 +43,8 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
-WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
+Way = Callable[[Problem, GeodesicDeformation], Any]
+WAYS: dict[str, Way] = {
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
         at.linearise(), problem.noise, rank=4
@@ -84,9 +85,7 @@ def test_linearisation_of_some_rows(problem: Problem) -> None:
 @pytest.mark.slow
 @every_way
 @every_problem
-def test_same_momenta_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
-) -> None:
+def test_same_momenta_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
     """Compared by their effect at the data, since flat directions of the momenta are rounding errors."""
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
@@ -98,9 +97,7 @@ def test_same_momenta_as_the_cholesky_factor(
 
 @every_way
 @every_problem
-def test_same_covariance_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
-) -> None:
+def test_same_covariance_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
     at = deformed(problem)
     queries = at.linearise(uniform(6, 2, seed=20))
     expected = CholeskyRegression(at.linearise(), problem.noise).covariance(queries)
@@ -158,7 +155,9 @@ def test_pivots_are_different_configurations_and_repeatable() -> None:
 
 
 @every_way
-def test_parameters_of_the_nominal_map(way: Callable[[Problem, GeodesicDeformation], Conditional]) -> None:
+def test_parameters_of_the_nominal_map(
+    way: Way,
+) -> None:
     """theta and its covariance by every method, for prior variances that differ from each other and from 1."""
     x = uniform(20, 2, seed=3)
     kernels = {"joint_kernel": dc.VonMises(1.0, 0.01), "task_kernel": dc.Gaussian(0.7, 0.01)}

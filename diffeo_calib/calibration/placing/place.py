@@ -18,12 +18,13 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.labels import MOST_MASSES, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, Settled
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
@@ -32,7 +33,7 @@ from diffeo_calib.calibration.placing.readings import (
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
+from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -206,8 +207,7 @@ class Placed:
         """
         centre = chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
         here = torch.eye(4, dtype=centre.dtype, device=centre.device)
-        found = Settled(fitted.shifts, Tensor, slice(0), fitted_map, centre, here, chosen)
-        placement = self.placement.settled(fitted, found)
+        placement = self.placement.settled(fitted, fitted_map, centre, here, chosen=chosen)
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)
@@ -271,13 +271,13 @@ class Placed:
         coordinates, readings = divided(data)
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, readings, len(data), centre)
-        placement = Placement(tuple(one.with_rows(other) for one in self.placement))
+        placement = Placement(one.with_rows(other) for one in self.placement)
         if coordinates is not None:
             table = placement.aligned(coordinates.table)
             for one in placement:
                 table = one.at_places(table)
             coordinates = coordinates._replace(table=table)
-            placement = Placement(tuple(one.in_own_frame(table) for one in placement))
+            placement = Placement(one.in_own_frame(table) for one in placement)
         count = len(data if coordinates is None else coordinates.rows)
         tails = Tails.none(count, self.identification.tails.weights.shape[1])
         found = replace(self.identification, tails=tails)
@@ -343,7 +343,16 @@ def _by_coordinates(
     own.table.check_every_marker_seen()
     sessions, table = Sessions.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
+    progress("registration", 0, 1)
+    sockets = list[SocketDevices]()
+    if table.sockets is None:
+        registration = registered(robot, table)
+        progress("geometry", 0, 1)
+        stages = registration, identify(registration.geometry, table.q, table.points)
+        check_identification(table, stages[1])
+    else:
+        places, table, stages = stages_by_sockets(robot, table)
+        sockets = [places.of_rows(own.rows, count)]
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])

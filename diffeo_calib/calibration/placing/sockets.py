@@ -38,20 +38,19 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
-from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -318,28 +317,6 @@ def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float,
     return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
 
 
-def coordinate_stages(
-    robot: Tree, own: Coordinates, count: int, progress: Progress
-) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
-    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
-
-    Args:
-        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
-
-    Raises:
-        MeasurementError: rows that cannot belong to this robot, or too few.
-    """
-    progress("registration", 0, 1)
-    if own.table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, own.table)
-        return [places.of_rows(own.rows, count)], table, stages
-    registration = registered(robot, own.table)
-    progress("geometry", 0, 1)
-    identification = identify(registration.geometry, own.table.q, own.table.points)
-    check_identification(own.table, identification)
-    return [], own.table, (registration, identification)
-
-
 def stages_by_sockets(
     robot: Tree, data: Measurements
 ) -> tuple[SocketDevices, Measurements, tuple[Identification, Identification]]:
@@ -428,15 +405,13 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     at = seen.geodesic.linearise(resting.q)
     last = torch.eye(seen.m, dtype=predicted.dtype, device=predicted.device)[-3:].expand(len(resting), -1, -1)
     own = seen.covariance_between(at.projected(last))
-    eye = torch.eye(3, dtype=own.dtype, device=own.device)
-    same = (socket[:, None] == socket).to(own)
-    K = own + torch.kron(PLACES.found_m_rad**2 * same, eye)
-    K = K + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1))
-    inverse = torch.linalg.inv(K)
-    mu = (inverse @ (middles - predicted).flatten()).view(-1, 3)
-    errors = torch.linalg.solve(diagonal_blocks(inverse, len(resting)), mu[..., None])[..., 0]
+    rests = torch.nn.functional.one_hot(socket).to(own)
+    places = torch.kron(PLACES.found_m_rad * rests, torch.eye(3, dtype=own.dtype, device=own.device))
+    factor = Factor.of(own + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1)), places)
+    mu = factor.solve((middles - predicted).view(-1, 1)).view(-1, 3)
+    errors = torch.linalg.solve(diagonal_blocks(factor.inverse, len(resting)), mu[..., None])[..., 0]
     squares = (mu * errors).sum(1)
-    judged = same.sum(1) > FEWEST_BESIDE
+    judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
         return []
     size = float(squares[judged].median()) / chi2_median(3)

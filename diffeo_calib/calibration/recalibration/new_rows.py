@@ -352,7 +352,7 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     sets += before.sessions
     readings = [_around(one.table, one.rows, seen) for one in before.readings]
     if told is not None and noise is not None and len(told.rows) == len(seen):
-        return told.noise_model, noise, {"y": told.y, "placement": Placement(tuple(sets))}
+        return told.noise_model, noise, {"y": told.y, "placement": Placement(sets)}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
     total = torch.diag_embed(torch.full_like(rows.y, usual_variance(before.fitted.noise)))
