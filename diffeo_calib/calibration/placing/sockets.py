@@ -38,6 +38,7 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
+from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
@@ -51,6 +52,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -315,6 +317,28 @@ def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float,
     """Spread of predicted positions (N, 3) within sockets, and errors of the known distances, m."""
     errors = socket_errors(predicted, socket, sockets)
     return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
+
+
+def coordinate_stages(
+    robot: Tree, own: Coordinates, count: int, progress: Progress
+) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
+    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
+
+    Args:
+        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
+
+    Raises:
+        MeasurementError: rows that cannot belong to this robot, or too few.
+    """
+    progress("registration", 0, 1)
+    if own.table.sockets is not None:
+        places, table, stages = stages_by_sockets(robot, own.table)
+        return [places.of_rows(own.rows, count)], table, stages
+    registration = registered(robot, own.table)
+    progress("geometry", 0, 1)
+    identification = identify(registration.geometry, own.table.q, own.table.points)
+    check_identification(own.table, identification)
+    return [], own.table, (registration, identification)
 
 
 def stages_by_sockets(
