@@ -238,3 +238,18 @@ def test_the_mode_needs_a_residual() -> None:
     problem = PROBLEMS["rr"]
     with pytest.raises(InputError, match="the mode of control points: expected their data's residual"):
         ControlPointRegression(deformed(problem), problem.x, problem.noise).mode()
+
+
+@pytest.mark.parametrize("way", [*WAYS, "cholesky"])
+def test_shifts_that_rows_share_are_parameters(way: str) -> None:
+    """cov(c) = (1 + Z^T (G + R)^-1 Z)^-1, with R the noise of the rows alone, and none with what knows nothing of c."""
+    problem = PROBLEMS["shared shifts"]
+    at, Z = deformed(problem), problem.noise.shared.flatten(0, 1)
+    lin, (m, c) = at.linearise(), problem.noise.shared.shape[1:]
+    conditional = CholeskyRegression(lin, problem.noise) if way == "cholesky" else WAYS[way](problem, at)
+    nothing = lin.rows(torch.tensor([0])).projected(torch.zeros(1, c, m, dtype=torch.float64))
+    K = lin.sensitivity.shape[2]
+    shifts = replace(nothing, sensitivity=torch.eye(K + c, dtype=torch.float64)[None, K:])
+    alone = lin.gram() + torch.block_diag(*problem.noise.covariance)
+    expected = torch.linalg.inv(torch.eye(c, dtype=torch.float64) + Z.T @ torch.linalg.solve(alone, Z))
+    torch.testing.assert_close(conditional.posterior(shifts)[0], expected, rtol=1e-3, atol=1e-9)
