@@ -35,7 +35,6 @@ FLOORS = (
     ("measurements", "rows, whatever measured them; CSV files"),
     ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
-    ("process.factor", "a covariance with features of any variance, factorised"),
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation"),
     ("process", "what is known of robot and devices from rows: one Gaussian process"),

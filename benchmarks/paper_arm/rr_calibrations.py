@@ -15,7 +15,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
 Predict = Callable[[Tensor], Tensor]
 """Joint angles (M, 2) [rad] -> tip (M, 2) [length units]."""
@@ -128,10 +128,10 @@ class Calibrated:
         lin = replace(self.data.lin, spec=self.recipe.spec(self.vector))
         for floor in JITTERS[:-1]:
             try:
-                return factorise(lin, self._noise(floor))
+                return CholeskyRegression(lin, self._noise(floor))
             except NumericalError:  # noise-free, with more rows than the scales were chosen on
                 continue
-        return factorise(lin, self._noise(JITTERS[-1]))
+        return CholeskyRegression(lin, self._noise(JITTERS[-1]))
 
     def _sigma(self, floor: float) -> float:
         return max(float(self.recipe.scales(self.vector)["noise"]), floor)

@@ -170,38 +170,24 @@ def _inflated(
     """The scales found, widened where cross-validation or places contradict them."""
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
+    groups = measurements.groups().to(data.x.device)
+    poses = int(groups.max()) + 1
+    few = left_out.inflation(poses)
     factor, row_scales, resting = 1.0, None, measurements.places >= 0
     if not bool(resting.all()):
-        factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
-        factor = max(factor, measurements.smallest_inflation)
+        inflation: float | None = few
+        if centre is None or (poses >= LIMITS.fewest_poses and not found.interrupted):
+            inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
+            found = replace(found, interrupted=inflation is None)
+        factor = max(inflation or few, measurements.smallest_inflation)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
     if bool(resting.any()):
-        row_scales = found.scales.inflated(max(factor, left_out.inflation(int(measurements.groups().max()) + 1)) ** 0.5)
-        units = measurements.places, measurements.socket_numbers, measurements.groups().to(resting.device)
+        row_scales = found.scales.inflated(max(factor, few) ** 0.5)
+        units = measurements.places, measurements.socket_numbers, groups.to(resting.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)
     return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales)
-
-
-def _inflation(
-    centre: Hyperparameters | None,
-    found: Selection,
-    data: TangentData,
-    measurements: Any,
-    *,
-    left_out: LeaveOneOut,
-    seed: int,
-    progress: Progress,
-) -> tuple[float, Selection]:
-    """Factor on all variances, and the selection, interrupted if Ctrl-C came; no ``centre``: scales of other robots."""
-    groups = measurements.groups().to(data.x.device)
-    poses = int(groups.max()) + 1
-    factor = left_out.inflation(poses)
-    if centre is not None and (poses < LIMITS.fewest_poses or found.interrupted):
-        return factor, found
-    inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
-    return inflation or factor, replace(found, interrupted=inflation is None)
 
 
 def noise_of_few(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
@@ -221,9 +207,13 @@ def _selected(
         return first, data
     start = None if data.tails.gross else first.scales  # which let the fields explain gross errors
     second = select(centre, data, start=start, seed=seed, progress=progress)
-    scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
-    data = data.with_tails(estimate_tails(data, scales, seed))
-    return replace(second, scales=scales), data
+    return _supported(second, data, seed)
+
+
+def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
+    """The same without amplitudes that the data do not support, and with the weights that follow."""
+    scales = found.scales.supported(data.jacobian, data.new_noise(found.scales))
+    return replace(found, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
 
 
 def _with_gear_lines(
@@ -236,9 +226,7 @@ def _with_gear_lines(
         return found, data
     data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
     centre = replace(centre, lines=lines, payload=start.payload)
-    again = select(centre, data, start=start, seed=seed, progress=progress)
-    scales = again.scales.supported(data.jacobian, data.new_noise(again.scales))
-    return replace(again, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
+    return _supported(select(centre, data, start=start, seed=seed, progress=progress), data, seed)
 
 
 def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:

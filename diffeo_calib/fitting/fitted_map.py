@@ -21,8 +21,8 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.regression.choose import condition_fit
-from diffeo_calib.regression.conditional import Conditional, Features
+from diffeo_calib.regression.choose import condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional, of_parameters
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
@@ -229,13 +229,11 @@ class FittedMap:
             at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
             columns: (c,) boolean, which of the shifts of the fit these are.
         """
-        known = self.conditional
+        known, K = self.conditional, len(self.geodesic.spec.prior_variance)
         known = known.conditional if isinstance(known, WithoutRigidMotions) else known
-        own, shifts = known.features(at), known.shift_features()[:, columns]
-        signed = own.signs[:, None] * shifts  # (f, k)
-        with_shifts = (own.values.mT @ signed).view(*at.sensitivity.shape[:2], -1)
-        cross = with_shifts @ effects.mT
-        return known.posterior(at) + cross + cross.mT + effects @ (shifts.mT @ signed) @ effects.mT
+        slopes = of_parameters(at, K + len(columns)).clone()
+        slopes[..., K:][..., columns] = effects
+        return known.posterior(replace(at, sensitivity=slopes))
 
     @of_origin
     def fitted_points(self) -> Tensor:
@@ -343,10 +341,13 @@ class FittedMap:
         return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
 
     def parameters_as_points(self, which: Tensor) -> Linearisation:
-        """The parameters with these numbers as if they were the coordinates of one configuration."""
-        at = self.geodesic.linearise(self.x[:1])
+        """The parameters with these numbers as if they were the coordinates of one configuration.
+
+        After those of the nominal map come the shifts that rows of the fit share, in units of their deviations.
+        """
+        at, shifts = self.geodesic.linearise(self.x[:1]), self.noise.shared.shape[2]
         nothing = at.sensitivity.new_zeros(1, len(which), at.sensitivity.shape[1])
-        chosen = torch.eye(at.sensitivity.shape[2], dtype=nothing.dtype, device=nothing.device)[which]
+        chosen = torch.eye(at.sensitivity.shape[2] + shifts, dtype=nothing.dtype, device=nothing.device)[which]
         return replace(at.projected(nothing), sensitivity=chosen[None])
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
@@ -399,10 +400,6 @@ class FittedMap:
         pull = deformation.end_momenta.reshape(deformation.z1.shape)
         return pull if self.slopes is None else (torch.linalg.pinv(self.slopes.mT) @ pull[:, :, None])[:, :, 0]
 
-    def features(self, at: Linearisation) -> Features:
-        """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""
-        return self.conditional.features(at)
-
     @property
     def geodesic(self) -> GeodesicDeformation:
         """The exact deformation.
@@ -434,7 +431,15 @@ class FittedMap:
     @of_origin
     def conditional(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
-        return condition_fit(self.geodesic, self.noise, self.data, self.workspace, self.slopes)
+        around, slopes = self.geodesic, self.slopes
+        if self.data is None:
+            at = around.linearise()
+            found: Conditional = condition(at if slopes is None else at.projected(slopes), self.noise)
+        else:
+            found = condition_controls(around, self.data, self.noise, slopes)
+        if self.workspace is None:
+            return found
+        return WithoutRigidMotions(found, around.linearise(self.workspace), around.spec.nominal.places[:6])
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")

@@ -124,7 +124,7 @@ class _Run:
         self.origin = self.best.flatten()
         if preconditioned:
             self.factor: CholeskyRegression | None = self.problem.preconditioner(self.best, self.integrator)
-            self.variables = torch.zeros_like(self.factor.factor[0], requires_grad=True)
+            self.variables = torch.zeros_like(self.factor.factor.L[0], requires_grad=True)
         else:
             self.factor = None
             self.variables = self.origin.clone().requires_grad_()

@@ -33,7 +33,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
 
 D = TypeVar("D", bound=Deformation)
@@ -203,7 +203,7 @@ class Regression:
         target: (N, m) measured minus linearised model at zero fields, m.
     """
 
-    conditional: Conditional
+    conditional: DataConditional
     target: Tensor
 
     def momenta(self) -> Momenta:

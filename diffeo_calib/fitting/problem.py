@@ -28,7 +28,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
-from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
 SMALLEST_NOISE = 1e-100
 """Smallest standard deviation in m: its square must not underflow."""
@@ -213,5 +213,5 @@ class Problem(Objective[GeodesicDeformation]):
         if self.reduced:
             count = len(self.controls)
             mean = self.noise.mean if slopes is None else coordinate_noise(self.noise, slopes)
-            return factorise(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
-        return factorise(at if slopes is None else at.projected(slopes), self.noise)
+            return CholeskyRegression(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
+        return CholeskyRegression(at if slopes is None else at.projected(slopes), self.noise)

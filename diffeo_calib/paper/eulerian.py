@@ -42,7 +42,7 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import DataConditional
 
 
 @dataclass(frozen=True)
@@ -362,7 +362,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return known if isinstance(known, CholeskyRegression) else self.exact.preconditioner(self.exact.zero(), RK4(1))
 
     @cached_property
-    def _conditional(self) -> Conditional:
+    def _conditional(self) -> DataConditional:
         return tangent(self.exact).conditional
 
     def start(self, integrator: Integrator) -> Start:

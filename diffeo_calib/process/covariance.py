@@ -15,14 +15,14 @@ from torch import Tensor
 
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.scales import Hyperparameters, SeparateKernels, SumOfKernels
+from diffeo_calib.process.scales import Hyperparameters, KernelValues
 
 
 class Values(NamedTuple):
     """K_V at pairs of configurations, and kappa of K_W = kappa I at pairs of points."""
 
-    joint: SumOfKernels
-    task: SeparateKernels
+    joint: KernelValues
+    task: KernelValues
 
 
 class Covariance:

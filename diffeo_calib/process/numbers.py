@@ -107,9 +107,9 @@ class Numbers:
         """Values (N, R, ...) of the table as those of the numbers (M, ...)."""
         return values.flatten(0, 1)[self.cells]
 
-    def in_table(self, values: Tensor, absent: float = 0.0) -> Tensor:
-        """The inverse, with a value where nothing was measured: (M, ...) -> (N, R, ...)."""
-        table = values.new_full((self.shape[0] * self.shape[1], *values.shape[1:]), absent)
+    def in_table(self, values: Tensor) -> Tensor:
+        """The inverse, zero where nothing was measured: (M, ...) -> (N, R, ...)."""
+        table = values.new_zeros(self.shape[0] * self.shape[1], *values.shape[1:])
         table[self.cells] = values
         return table.view(*self.shape, *values.shape[1:])
 

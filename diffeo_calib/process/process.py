@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 
 import torch
 from torch import Tensor
@@ -21,10 +22,10 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.covariance import Covariance
-from diffeo_calib.process.factor import Factor
 from diffeo_calib.process.numbers import Numbers
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import NOISE_ADVICE
+from diffeo_calib.regression.factor import Factor
 
 
 @dataclass(frozen=True)
@@ -153,10 +154,18 @@ class Process:
         """log N(target; 0, K) of all numbers; that of later ones given the others is a difference."""
         return self.factor.log_density(self.numbers.target, self.mu)
 
-    def left_out(self, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-        """Errors of groups of numbers as all others predict them, and their covariances with noise: (g,), (g, g)."""
-        found = []
-        for group in groups:
-            covariance = torch.linalg.inv(self.inverse[group[:, None], group])
-            found.append((covariance @ self.mu[group], covariance))
-        return found
+    def left_out(self, group: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (M,) of groups of numbers as all others predict them, and their covariances with noise in (M, M).
+
+        Args:
+            group: (M,) that of each number; negative for none, with the error NaN.
+        """
+        errors, covariance = torch.full_like(self.mu, nan), torch.zeros_like(self.inverse)
+        counts = group[group >= 0].unique(return_counts=True)[1]
+        parts = group.argsort(stable=True)[int((group < 0).sum()) :].split(counts.tolist())
+        for size in counts.unique().tolist():
+            at = torch.stack([part for part in parts if len(part) == size])
+            block = torch.linalg.inv(self.inverse[at[:, :, None], at[:, None]])
+            errors[at] = (block @ self.mu[at][:, :, None])[:, :, 0]
+            covariance[at[:, :, None], at[:, None]] = block
+        return errors, covariance

@@ -17,9 +17,9 @@ autograd follows the scales only: d/d r_l sum W a^2 kappa(sum_l r_l d_l) = a^2 s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -105,48 +105,26 @@ class Hyperparameters:
     other_noise: Tensor | None = None
 
     def joint_kernel(self, space: Space) -> Kernel:
-        """K_V on the joint space."""
-        return self.transmission_kernel(space) + self.coupled_kernel(space)
-
-    def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l."""
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, TRANSMISSION_PROFILE)
-
-    def coupled_kernel(self, space: Space) -> Kernel:
-        """diag_l c_l^2 k_all."""
-        return RadialKernel(
-            COUPLED_PROFILE,
-            lengthscale=self.coupled_lengthscale,
-            variance=self.coupled_amplitude**2,
-            periodic=space.periodic,
-        )
+        """K_V on the joint space: diag_l a_l^2 k_l + c_l^2 k_all."""
+        lengthscale, variance = self.coupled_lengthscale, self.coupled_amplitude**2
+        coupled = RadialKernel(COUPLED_PROFILE, lengthscale=lengthscale, variance=variance, periodic=space.periodic)
+        own = self.transmission_lengthscale, self.transmission_amplitude**2
+        return PerJoint(*own, space, TRANSMISSION_PROFILE) + coupled
 
     def task_kernel(self) -> Kernel:
         """K_W on R^3."""
         return RadialKernel(TASK_PROFILE, lengthscale=self.task_lengthscale, variance=self.task_amplitude**2)
 
-    def joint_kernel_values(self, squared_distances: Tensor) -> SumOfKernels:
-        """The diagonals of K_V for many scales of the same points.
+    def joint_kernel_values(self, squared_distances: Tensor) -> KernelValues:
+        """K_V, diagonal (n, M, N) in rad^2 or m^2, for squared distances (n, M, N) of every joint."""
+        own = Term(TRANSMISSION_PROFILE, self.transmission_amplitude, self.transmission_lengthscale)
+        coupled = Term(COUPLED_PROFILE, self.coupled_amplitude, self.coupled_lengthscale, joined=True)
+        return KernelValues(squared_distances, own, coupled)
 
-        Args:
-            squared_distances: (n, M, N) of every joint, see :meth:`Space.squared_distances`.
-
-        Returns:
-            with values (n, M, N), in rad^2 or m^2, those of :meth:`joint_kernel`.
-        """
-        own = self.transmission_amplitude, self.transmission_lengthscale
-        coupled = self.coupled_amplitude, self.coupled_lengthscale
-        return SumOfKernels(
-            [
-                SeparateKernels(TRANSMISSION_PROFILE, squared_distances, *own),
-                JoinedKernel(COUPLED_PROFILE, squared_distances, *coupled),
-            ]
-        )
-
-    def task_kernel_values(self, squared_distances: Tensor) -> SeparateKernels:
+    def task_kernel_values(self, squared_distances: Tensor) -> KernelValues:
         """kappa of K_W = kappa I for squared distances (M, N) in m^2, with values (1, M, N), m^2."""
-        scales = self.task_amplitude.reshape(1), self.task_lengthscale.reshape(1)
-        return SeparateKernels(TASK_PROFILE, squared_distances[None], *scales)
+        term = Term(TASK_PROFILE, self.task_amplitude.reshape(1), self.task_lengthscale.reshape(1))
+        return KernelValues(squared_distances[None], term)
 
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACES.found_m_rad) -> Tensor:
         """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag and of gear lines.
@@ -224,63 +202,43 @@ SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not
 """Names of the scales that are tensors and that all measurements have."""
 
 
-class SeparateKernels:
-    """a_l^2 kappa(r_l d_l), a kernel for every coordinate l.
+class Term(NamedTuple):
+    """a_l^2 kappa(r_l d_l), r_l = lengthscale_l^-2; ``joined``: of all coordinates, a_l^2 kappa(sum_k r_k d_k)."""
 
-    Args:
-        profile: kappa. distances: (n, M, N) d_l. amplitudes, lengthscales: (n,).
+    profile: Profile
+    amplitudes: Tensor
+    lengthscales: Tensor
+    joined: bool = False
+
+
+class KernelValues:
+    """A sum of terms for squared distances d (n, M, N) of n coordinates.
 
     Attributes:
         values: (n, M, N), detached.
     """
 
-    def __init__(self, profile: Profile, distances: Tensor, amplitudes: Tensor, lengthscales: Tensor) -> None:
-        self.distances, self.variances, self.rates = distances, amplitudes**2, lengthscales.pow(-2)
-        scaled = distances * self.rates.detach()[:, None, None]
-        self.kappa, self.slope = profile.derivatives(scaled, 1)
-        self.values = self.variances.detach()[:, None, None] * self.kappa
+    def __init__(self, distances: Tensor, *terms: Term) -> None:
+        self.distances, self._terms, values = distances, list[tuple[Term, Tensor, Tensor]](), list[Tensor]()
+        for term in terms:
+            rates = term.lengthscales.detach().pow(-2)
+            scaled = torch.tensordot(rates, distances, dims=1) if term.joined else distances * rates[:, None, None]
+            kappa, slope = term.profile.derivatives(scaled, 1)
+            self._terms.append((term, kappa, slope))
+            values.append(term.amplitudes.detach().square()[:, None, None] * kappa)
+        self.values = reduce(torch.add, values)
 
     def inner(self, weights: Tensor) -> Tensor:
         """sum(weights * values) for weights (n, M, N), differentiable in the scales: scalar."""
-        sums = (weights * self.kappa).sum((1, 2))
-        slopes = (weights * self.slope).mul_(self.distances).sum((1, 2))
-        return self.variances @ sums + (self.variances.detach() * slopes) @ _change(self.rates)
-
-
-class JoinedKernel:
-    """a_l^2 kappa(sum_l r_l d_l), one kernel of all coordinates with an amplitude for every component of the field.
-
-    Args:
-        profile: kappa. distances: (n, M, N) d_l. amplitudes: (k,) of the components. lengthscales: (n,).
-
-    Attributes:
-        values: (k, M, N), detached.
-    """
-
-    def __init__(self, profile: Profile, distances: Tensor, amplitudes: Tensor, lengthscales: Tensor) -> None:
-        self.distances, self.variances, self.rates = distances, amplitudes**2, lengthscales.pow(-2)
-        self.kappa, self.slope = profile.derivatives(torch.tensordot(self.rates.detach(), distances, dims=1), 1)
-        self.values = self.variances.detach()[:, None, None] * self.kappa
-
-    def inner(self, weights: Tensor) -> Tensor:
-        """sum(weights * values) for weights (k, M, N), differentiable in the scales: scalar."""
-        sums = weights.flatten(1) @ self.kappa.flatten()
-        pooled = torch.tensordot(self.variances.detach(), weights, dims=1).mul_(self.slope)
-        return self.variances @ sums + (self.distances.flatten(1) @ pooled.flatten()) @ _change(self.rates)
-
-
-class SumOfKernels:
-    """The sum of such kernels; attributes and methods as theirs."""
-
-    def __init__(self, terms: Sequence[SeparateKernels | JoinedKernel]) -> None:
-        self.terms = terms
-        self.values = reduce(torch.add, [term.values for term in terms])
-
-    def inner(self, weights: Tensor) -> Tensor:
-        """sum(weights * values), differentiable in the scales: scalar."""
-        return reduce(torch.add, [term.inner(weights) for term in self.terms])
-
-
-def _change(rates: Tensor) -> Tensor:
-    """Zero, with the derivative one by the rates."""
-    return rates - rates.detach()
+        total = weights.new_zeros(())
+        for term, kappa, slope in self._terms:
+            variances, rates = term.amplitudes.square(), term.lengthscales.pow(-2)
+            if term.joined:
+                sums = weights.flatten(1) @ kappa.flatten()
+                pooled = torch.tensordot(variances.detach(), weights, dims=1).mul_(slope)
+                slopes = self.distances.flatten(1) @ pooled.flatten()
+            else:
+                sums = (weights * kappa).sum((1, 2))
+                slopes = variances.detach() * (weights * slope).mul_(self.distances).sum((1, 2))
+            total = total + variances @ sums + slopes @ (rates - rates.detach())  # zero, with a derivative
+        return total

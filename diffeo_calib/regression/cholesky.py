@@ -1,103 +1,97 @@
-"""Conditioning by one Cholesky factor of G + R: momenta, leave-one-out errors."""
+"""Conditioning by one Cholesky factor, with the parameters apart from the fields.
+
+A parameter such as the place of the base has a prior deviation of decimetres, and predictions deviate by micrometres:
+the difference G(x, x) - G(x, data) (G + R)^-1 G(data, x) loses eight digits and more. With G = F + S Lambda^-1 S^T, F
+the covariance of the fields, it is
+
+    F(x, x) - F(x, data) (F + R)^-1 F(data, x) + D (Lambda + S^T (F + R)^-1 S)^-1 D^T
+    D = S(x) - F(x, data) (F + R)^-1 S
+
+(Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which
+nothing large cancels. Shifts that rows share (:class:`Noise`) are parameters, too.
+"""
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import HIDDEN_VARIANCE, Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.conditional import (
+    DataConditional,
+    FeatureConditional,
+    Features,
+    diagonal_blocks,
+    of_parameters,
+)
+from diffeo_calib.regression.factor import Factor
 
 
-class CholeskyRegression(DataConditional):
-    """Conditioning by a Cholesky factor of G + R. Coordinates that were not measured take no part.
+class CholeskyRegression(FeatureConditional, DataConditional):
+    """Conditioning by a :class:`Factor` of G + R. Coordinates that were not measured take no part.
 
     Args:
-        linearisation: first-order response of k1 at the data.
-        factor: (S, S) lower Cholesky factor of G + R, of the S coordinates that were measured.
-        seen: (S,) their numbers among the N m; None if all were measured.
+        linearisation: first-order response of k1 at the data. noise: R.
+
+    Attributes:
+        seen: the S coordinates that were measured, among the N m. factor: of these, (S, S).
+
+    Raises:
+        NumericalError: F + R is not positive definite in float64.
     """
 
-    def __init__(self, linearisation: Linearisation, factor: Tensor, seen: Tensor | None = None) -> None:
+    def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
         super().__init__(linearisation)
-        self.factor, self.seen = factor, seen
+        visible, shared = noise.visible, noise.shared
+        self.seen = slice(None) if bool(visible.all()) else visible.flatten().nonzero()[:, 0]
+        self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
+        matrix = noise.own.add_to(linearisation.fields.gram())
+        slopes = torch.cat([linearisation.sensitivity * self.deviations, shared], 2).flatten(0, 1)
+        self.deviations = torch.cat([self.deviations, shared.new_ones(shared.shape[2])])
+        self.factor = Factor.of(matrix[self.seen][:, self.seen], slopes[self.seen])
 
     def solve(self, values: Tensor) -> Tensor:
         """(G + R)^-1 values: (N, m, k) -> (N, m, k); zero where nothing was measured."""
-        flat = values.flatten(0, 1)
-        return self.spread(torch.cholesky_solve(self.measured(flat), self.factor)).view_as(values)
+        return self._spread(self.factor.solve(values.flatten(0, 1)[self.seen])).view_as(values)
 
-    def explained(self, cross: Tensor) -> Tensor:
-        """cross (G + R)^-1 cross^T = |L^-1 cross^T|^2, half the work of a solution: (M, r, N m) -> (M, r, r)."""
-        cross = cross if self.seen is None else cross[..., self.seen]
-        with large_work(cross.numel()):
-            white = torch.linalg.solve_triangular(self.factor.T, cross.flatten(0, 1), upper=True, left=False)
-            white = white.view_as(cross)
-            return white @ white.mT
-
-    def measured(self, flat: Tensor) -> Tensor:
-        """The measured ones of rows: (N m, ...) -> (S, ...)."""
-        return flat if self.seen is None else flat[self.seen]
-
-    def spread(self, flat: Tensor) -> Tensor:
-        """The inverse of :meth:`measured`, zero elsewhere: (S, ...) -> (N m, ...)."""
-        return flat if self.seen is None else flat.new_zeros(self.size, *flat.shape[1:]).index_copy(0, self.seen, flat)
+    def momenta(self, target: Tensor) -> Momenta:
+        """Fields by mu, transported back to time 0; parameters apart, since S^T mu would lose their digits."""
+        mu, shift = self.factor.solved(target.flatten()[self.seen, None])
+        found = self.linearisation.fields.momenta(self._spread(mu[:, 0]).view_as(target))
+        return replace(found, theta=(self.deviations * shift[:, 0])[: len(self.linearisation.spec.prior_variance)])
 
     def of_white(self, values: Tensor) -> Tensor:
-        """L^-T values: (S,) -> (N m,)."""
-        return self.spread(torch.linalg.solve_triangular(self.factor.T, values[:, None], upper=True)[:, 0])
+        """C values with C C^T = (G + R)^-1: (S,) -> (N m,)."""
+        return self._spread(self.factor.of_white(values))
 
-    @cached_property
-    def inverse(self) -> Tensor:
-        """(G + R)^-1, kept from then on: (N m, N m)."""
-        return self._inverted()
+    def left_out(self, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (N, m) of every configuration predicted by all others, [(G + R)^-1]_ii^-1 mu_i, and their covariance.
 
-    def inverse_blocks(self, rows: int) -> Tensor:
-        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
-        return diagonal_blocks(self.inverse if "inverse" in vars(self) else self._inverted(), rows)
+        The covariance (N, m, m) holds the noise of the configuration itself; it is one where nothing was measured.
+        """
+        inverse = torch.eye(self.size, dtype=target.dtype, device=target.device)
+        at = torch.arange(self.size, device=target.device)[self.seen]
+        inverse[at[:, None], at] = self.factor.inverse
+        own = torch.linalg.inv(diagonal_blocks(inverse, len(target)))
+        return (own @ self.mu(target)[:, :, None])[:, :, 0], own
 
-    def matrix(self) -> Tensor:
-        """G + R, in which coordinates that were not measured have their variance alone: (N m, N m)."""
-        return self._whole(self.factor @ self.factor.T, HIDDEN_VARIANCE)
+    def features(self, at: Linearisation) -> Features:
+        """Information of the data about the fields (M r, S), and about the parameters without it (M r, K + c)."""
+        L, W, B = self.factor.L, self.factor.W, self.factor.B
+        cross = self.linearisation.fields.gram(at.fields).T[:, self.seen]
+        with large_work(cross.numel()):
+            known = torch.linalg.solve_triangular(L.T, cross, upper=True, left=False)  # (M r, S)
+        unknown = of_parameters(at, len(B)).flatten(0, 1) * self.deviations - known @ W  # D Lambda^-1/2
+        unknown = torch.linalg.solve_triangular(B.T, unknown, upper=True, left=False)
+        return Features.of((known.T, -1), (unknown.T, 1))
 
-    def _inverted(self) -> Tensor:
-        with large_work(self.factor.numel()):
-            return self._whole(torch.cholesky_inverse(self.factor), 1.0 / HIDDEN_VARIANCE)
-
-    def _whole(self, matrix: Tensor, hidden: float) -> Tensor:
-        """A matrix (S, S) of the measured coordinates as one of all, with the same number for each other one."""
-        if self.seen is None:
-            return matrix
-        whole = torch.diag(matrix.new_full((self.size,), hidden))
-        whole[self.seen[:, None], self.seen] = matrix
-        return whole
-
-
-def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
-    """Build G + R and its Cholesky factor; pass ``gram`` if G is known already.
-
-    Raises:
-        NumericalError: G + R is not positive definite in float64.
-    """
-    matrix = noise.add_to(linearisation.gram() if gram is None else gram)
-    seen = seen_numbers(noise.visible)
-    matrix = matrix if seen is None else matrix[seen[:, None], seen]
-    with large_work(matrix.numel()):
-        factor, info = torch.linalg.cholesky_ex(matrix)
-    if int(info):
-        raise NumericalError.of(
-            "the matrix G + R of the Gauss-Newton step is not positive definite",
-            expected="noise that float64 can resolve beside the kernels' amplitudes",
-            fix=NOISE_ADVICE,
-        )
-    return CholeskyRegression(linearisation, factor, seen)
-
-
-def seen_numbers(visible: Tensor) -> Tensor | None:
-    """Numbers (S,) of the coordinates that were measured, (N, m) boolean; None if all were."""
-    return None if bool(visible.all()) else visible.flatten().nonzero()[:, 0]
+    def _spread(self, flat: Tensor) -> Tensor:
+        """Values (S, ...) of what was measured as those of all, zero elsewhere: (N m, ...)."""
+        if isinstance(self.seen, slice):
+            return flat
+        return flat.new_zeros(self.size, *flat.shape[1:]).index_copy(0, self.seen, flat)

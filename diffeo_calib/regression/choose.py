@@ -11,12 +11,10 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import Conditional, DataConditional
+from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
 from diffeo_calib.regression.control_points import BLOCK_ENTRIES, ControlPointRegression
-from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 LinearSolver = Literal["auto", "cholesky", "cg"]
 
@@ -35,59 +33,14 @@ def condition(
 
     Raises:
         InputError: the method needs more memory than is free.
-        NumericalError: G + R is not positive definite in float64.
+        NumericalError: F + R is not positive definite in float64.
     """
     n, m, _ = noise.covariance.shape
     method = choose(linear, n * m)
     check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
-    return (
-        factorise(linearisation, noise)
-        if method == "cholesky"
-        else ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
-    )
-
-
-def condition_for_covariances(linearisation: Linearisation, noise: Noise) -> DataConditional:
-    """Condition on data that are all control points, by the method that is best for covariances.
-
-    Raises:
-        InputError: the method needs more memory than is free.
-        NumericalError: F + R is not positive definite in float64.
-    """
-    n, m, _ = noise.covariance.shape
-    if choose("auto", n * m) != "cholesky":
-        return condition(linearisation, noise)
-    check_memory(predicted_memory("cholesky", n * m), f"covariances from {n * m} measured coordinates")
-    return ExplicitParameterRegression(linearisation, noise)
-
-
-def condition_fit(
-    deformation: GeodesicDeformation,
-    noise: Noise,
-    data: Tensor | None = None,
-    workspace: Tensor | None = None,
-    slopes: Tensor | None = None,
-) -> Conditional:
-    """The fields around fitted flows, conditioned on the data, for covariances.
-
-    Args:
-        deformation: the flows. noise: R.
-        data: (N, n) configurations of the measurements; None if they are the control points.
-        workspace: (M, n) configurations over which rigid motions are left out; None for none.
-        slopes: (N, r, m) linear functionals that were measured; None for all coordinates.
-
-    Raises:
-        InputError: the method needs more memory than is free.
-    """
-    if data is None:
-        at = deformation.linearise()
-        at = at if slopes is None else at.projected(slopes)
-        found: Conditional = condition_for_covariances(at, noise)
-    else:
-        found = condition_controls(deformation, data, noise, slopes)
-    if workspace is None:
-        return found
-    return WithoutRigidMotions(found, deformation.linearise(workspace), deformation.spec.nominal.places[:6])
+    if method == "cholesky":
+        return CholeskyRegression(linearisation, noise)
+    return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
 
 
 def condition_controls(

@@ -39,15 +39,11 @@ class Features(NamedTuple):
 
 
 class Conditional(ABC):
-    """The Gaussian conditional of one linearisation on the data."""
+    """The Gaussian conditional of one linearisation on the data.
 
-    @abstractmethod
-    def momenta(self, target: Tensor) -> Momenta:
-        """Posterior mode of b, p, theta.
-
-        Args:
-            target: (N, m) measured minus linearised model at zero fields, m.
-        """
+    Shifts that rows of the data share are parameters of unit variance after those of the nominal map. Linearisations
+    that take part in some have columns for all; others have none.
+    """
 
     @property
     @abstractmethod
@@ -100,10 +96,6 @@ class Conditional(ABC):
         what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
         raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
 
-    def shift_features(self) -> Tensor:
-        """The same features of the shifts that rows share: (k, c)."""
-        raise InputError.of("features of shared shifts", fix="calibrate with fewer control points (`controls=200`)")
-
 
 class FeatureConditional(Conditional):
     """A conditional whose covariances are those of its :class:`Features`: nothing large cancels in them."""
@@ -139,20 +131,12 @@ class DataConditional(Conditional):
         """(G + R)^-1 target: (N, m) -> (N, m)."""
         return self.solve(target[:, :, None])[:, :, 0]
 
-    def inverse_blocks(self, rows: int) -> Tensor:
-        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m); only where there is a factor of G + R."""
-        raise NotImplementedError
-
-    def left_out(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors (N, m) of every configuration predicted by all others, [(G + R)^-1]_ii^-1 mu_i, and their covariance.
-
-        The covariance (N, m, m) holds the noise of the configuration itself.
-        """
-        own = torch.linalg.inv(self.inverse_blocks(len(target)))
-        return (own @ self.mu(target)[:, :, None])[:, :, 0], own
-
     def momenta(self, target: Tensor) -> Momenta:
-        """mu transported back to time 0."""
+        """Posterior mode of b, p, theta: mu transported back to time 0.
+
+        Args:
+            target: (N, m) measured minus linearised model at zero fields, m.
+        """
         return self.linearisation.momenta(self.mu(target))
 
     @property
@@ -160,23 +144,15 @@ class DataConditional(Conditional):
         """N m."""
         return self.linearisation.sensitivity.shape[:2].numel()
 
-    def posterior(self, at: Linearisation) -> Tensor:
-        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
-        cross = self.linearisation.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
-        return at.own_blocks() - self.explained(cross)
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
-        both = [at] if other is None else [at, other]
-        cross = torch.cat([self.linearisation.gram(points) for points in both], 1)
-        explained = self.explained(cross.T[None])[0]
-        split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
-        return at.gram(other) - explained[: split or None, split:]
-
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""
         columns = cross.flatten(0, 1).T.reshape(*self.linearisation.sensitivity.shape[:2], -1)  # (N, m, M r)
         return cross @ self.solve(columns).flatten(0, 1).view(-1, *cross.shape[:2]).movedim(0, 1)
+
+
+def of_parameters(at: Linearisation, count: int) -> Tensor:
+    """Derivatives (M, r, count) by all parameters, zero by shifts of which a linearisation says nothing."""
+    return torch.nn.functional.pad(at.sensitivity, (0, count - at.sensitivity.shape[2]))
 
 
 def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:

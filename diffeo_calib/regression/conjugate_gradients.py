@@ -9,6 +9,7 @@ and few iterations are needed.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -18,7 +19,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional
+from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, of_parameters
 
 BLOCK_CONFIGURATIONS = 64
 """Number of configurations that are drawn together."""
@@ -112,7 +113,6 @@ class Preconditioner:
 
     def __init__(self, factor: Tensor, rest: Tensor, noise: Noise) -> None:
         n, m, _ = noise.covariance.shape
-        factor = torch.cat([factor, noise.shared.flatten(0, 1)], 1)  # shared shifts count as part of G
         self.noise = Noise(noise.covariance + torch.diag_embed(rest.view(n, m)))
         self.white = self.noise.whiten(factor.view(n, m, -1)).flatten(0, 1)  # (N m, r)
         eye = torch.eye(self.white.shape[1], dtype=factor.dtype, device=factor.device)
@@ -162,10 +162,18 @@ class ConjugateGradientRegression(DataConditional):
         self, linearisation: Linearisation, noise: Noise, *, rank: int = MAX_RANK, tolerance: float = CG_TOLERANCE
     ) -> None:
         super().__init__(linearisation)
-        self.noise, self.tolerance = noise, tolerance
+        self.noise, self.tolerance = noise.own, tolerance
+        ones = noise.shared.new_ones(noise.shared.shape[2])
+        self.spec = replace(linearisation.spec, prior_variance=torch.cat([linearisation.spec.prior_variance, ones]))
+        whole = torch.cat([linearisation.sensitivity, noise.shared], 2)
+        self.whole = self._with_shifts(replace(linearisation, sensitivity=whole))
         max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].sum())
-        self.preconditioner = Preconditioner(*partial_cholesky(linearisation, max_rest, rank), noise)
+        self.preconditioner = Preconditioner(*partial_cholesky(self.whole, max_rest, rank), self.noise)
         self.iterations = 0
+
+    def _with_shifts(self, at: Linearisation) -> Linearisation:
+        """A linearisation by all parameters, of which the last are the shifts that rows share."""
+        return replace(at, spec=self.spec, sensitivity=of_parameters(at, len(self.spec.prior_variance)))
 
     @property
     def rank(self) -> int:
@@ -186,7 +194,7 @@ class ConjugateGradientRegression(DataConditional):
             if bool((_norm(residual) <= self.tolerance * size).all()):
                 break
             self.iterations += 1
-            image = self.linearisation.product(direction) + self.noise.multiply(direction)
+            image = self.whole.product(direction) + self.noise.multiply(direction)
             step = _ratio(rz, _dot(direction, image))
             x = x + step * direction
             residual = residual - step * image
@@ -202,6 +210,21 @@ class ConjugateGradientRegression(DataConditional):
                 fix="raise `noise`, lower the kernels' variances, or fit with control points (`controls=500`)",
             )
         return x
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
+        at = self._with_shifts(at)
+        cross = self.whole.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
+        return at.own_blocks() - self.explained(cross)
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
+        at, other = self._with_shifts(at), None if other is None else self._with_shifts(other)
+        both = [at] if other is None else [at, other]
+        cross = torch.cat([self.whole.gram(points) for points in both], 1)
+        explained = self.explained(cross.T[None])[0]
+        split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
+        return at.gram(other) - explained[: split or None, split:]
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T; for large problems with the preconditioner's matrix in place of G + R.

@@ -34,7 +34,7 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, FeatureConditional, Features
+from diffeo_calib.regression.conditional import NOISE_ADVICE, FeatureConditional, Features, of_parameters
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
@@ -152,19 +152,8 @@ class ControlPointRegression(FeatureConditional):
         with large_work(rows.numel()):
             expressed = self._whiten(rows.T)  # (size, M r)
             left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
-        return Features.of((expressed[: self._fields], -1), (left, 1))
-
-    def shift_features(self) -> Tensor:
-        """The posterior of the shifts."""
-        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)
-        own = own[:, len(own) - self._shifts :]
-        left = torch.linalg.solve_triangular(self.core, own, upper=False)
-        return torch.cat([own[: self._fields], left])
-
-    @property
-    def _fields(self) -> int:
-        """Number of momenta of the fields."""
-        return len(self.core) - self.like.theta.numel() - self._shifts
+        fields = len(self.core) - self.like.theta.numel() - self._shifts  # momenta
+        return Features.of((expressed[:fields], -1), (left, 1))
 
     def _blocks(self, size: int) -> list[Tensor]:
         """Row numbers of the blocks of data that this process works on."""
@@ -177,7 +166,7 @@ class ControlPointRegression(FeatureConditional):
         return value, at if self.slopes is None else at.projected(self.slopes[rows])
 
     def _rows(self, at: Linearisation) -> Tensor:
-        """Rows of A for the configurations of a linearisation, which take part in no shared shift: (M m, size)."""
+        """Rows of A for the configurations of a linearisation: (M m, size)."""
         columns = []
         for kernel, points, controls in (
             (self.spec.joint_kernel, at.joint, self.joint),
@@ -188,8 +177,7 @@ class ControlPointRegression(FeatureConditional):
                 for a, c in zip(points, controls, strict=True)
             ]
             columns.append(torch.stack(terms).sum(0) if len(terms) > 1 else terms[0])
-        slopes = at.sensitivity.flatten(0, 1)
-        return torch.cat([*columns, slopes, slopes.new_zeros(len(slopes), self._shifts)], 1)
+        return torch.cat([*columns, of_parameters(at, self.like.theta.numel() + self._shifts).flatten(0, 1)], 1)
 
     def _white_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """k1 (M, m) at the data with these row numbers, and their columns of B^T: (size, M r)."""

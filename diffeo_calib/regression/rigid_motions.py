@@ -15,9 +15,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.regression.conditional import Conditional, Features
+from diffeo_calib.regression.conditional import Conditional
 
 ROWS_AT_ONCE = 64
 """Configurations whose covariances with the reference are computed together."""
@@ -36,10 +35,6 @@ class WithoutRigidMotions(Conditional):
         self.conditional, self.reference, self.base = conditional, reference, list(base)
         self.fit = torch.linalg.pinv(reference.sensitivity.flatten(0, 1)[:, self.base])  # (6, M m)
         self.motion = self.fit @ conditional.covariance_between(reference) @ self.fit.mT
-
-    def momenta(self, target: Tensor) -> Momenta:
-        """As of the conditional."""
-        return self.conditional.momenta(target)
 
     @property
     def size(self) -> int:
@@ -74,18 +69,3 @@ class WithoutRigidMotions(Conditional):
             - B @ self.with_motion(second).mT
             + B @ self.motion @ B2.mT
         )
-
-    def features(self, at: Linearisation) -> Features:
-        """Those of the conditional, and of what is left out: -(c B^T + B c^T) = ((c - B) ... - (c + B) ...) / 2."""
-        inner, B, cross = (
-            self.conditional.features(at),
-            at.sensitivity.flatten(0, 1)[:, self.base],
-            self.with_motion(at),
-        )
-        scale = self.motion.diagonal().sqrt()
-        B, cross = B * scale, cross / scale
-        less, more = (cross - B).mT / 2**0.5, (cross + B).mT / 2**0.5
-        values, vectors = torch.linalg.eigh(self.motion / scale / scale[:, None])
-        own = (B @ (vectors * values.clamp(min=0).sqrt())).mT
-        added = Features.of((less, 1), (more, -1), (own, 1))
-        return Features(torch.cat([inner.values, added.values]), torch.cat([inner.signs, added.signs]))

@@ -22,6 +22,7 @@ from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
+from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -31,8 +32,6 @@ OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
-FEWEST_PER_DEVICE = 8
-"""Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
 
 
 class Hypothesis(NamedTuple):
@@ -314,7 +313,7 @@ class ReadPoints(Observation):
 
 
 def check_devices(data: Readings) -> None:
-    """Refuse devices with too few rows to be placed."""
+    """Refuse devices with too few rows to be placed: a plane, a fixed point or a camera takes three to six numbers."""
     short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
     if short:
         fix = "check the names in these rows, measure more rows of them, or leave them out"

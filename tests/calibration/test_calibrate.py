@@ -135,7 +135,6 @@ def test_noise_free_data_can_be_calibrated() -> None:
     case = calibrated(40, transmission=0, gravity=0, noise=0)
     assert case.held_out()[2] < 1e-6
     assert case.result.fit.converged
-    assert case.result.status.startswith("converged to rounding: residual ")  # finer time steps change nothing
 
 
 @pytest.mark.slow

@@ -155,6 +155,6 @@ def test_known_distances_that_are_not_used_are_named() -> None:
 
 def test_too_few_contacts_of_a_socket_are_refused() -> None:
     rows = with_sockets()[1]
-    few = dc.Observations.joined([rows.parts[0], rows.parts[1].rows(slice(0, 5))])
+    few = dc.Observations.joined([rows.parts[0], rows.parts[1].rows(slice(0, 3))])
     with pytest.raises(MeasurementError, match=r"at least 8 rows of each device"):
         dc.calibrate(kind().robot, few, hyperparameters=kind().scales)

@@ -44,7 +44,7 @@ def moved(data: TangentData, row: int, coordinates: slice, by: float) -> Tangent
 
 
 def chosen(setting: Setting) -> Chosen:
-    limits = SearchLimits(fewest_first=12, most_first=12)
+    limits = SearchLimits(fewest_first=15, most_first=15)
     return Chosen(setting.tangent_data, select(setting.scales, setting.tangent_data, limits=limits).scales)
 
 

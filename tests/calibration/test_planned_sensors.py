@@ -55,7 +55,7 @@ def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
 
 def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[float]:
     """RMS error over q after 0, 1, ... readings (row, device), after a rigid fit: the whole covariance inverted."""
-    fitted_map, devices = result.model.map, result.placement.sets[0].devices
+    fitted_map, devices = result.model.map, result.placement[0].devices
     conditional = fitted_map.conditional
     assert isinstance(conditional, WithoutRigidMotions)
     z, at = fitted_map.geodesic.linearised_value(q)
@@ -89,7 +89,7 @@ def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
     q = SimulatedArm(seed=1).sample(20, seed=8)
     plan = dc.plan(result.model, q, 5)
     sensors: Any = sensor_of(result.model)
-    known = result.placement.sets[0].devices.constants
+    known = result.placement[0].devices.constants
     told = slice(0, 3 if kind == "height" else None)  # the distance of a plane changes no slope
     own = {one.devices.names[0]: int((known - one.devices.constants)[:, told].norm(dim=1).argmin()) for one in sensors}
     order = plan.rank.argsort()
@@ -145,7 +145,7 @@ def test_expected_errors_of_distances_come_true() -> None:
     arm, result = SimulatedArm(seed=1), fitted("distance")
     q = arm.sample(300, seed=11)
     plan = dc.plan(result.model, q, 15)
-    devices: Any = result.placement.sets[0].devices
+    devices: Any = result.placement[0].devices
     sensors: Any = sensor_of(result.model)
     where = {one.devices.names[0]: one.devices.constants[0, :3] for one in sensors}
     numbers = [int((devices.constants[:, :3] - where[name]).norm(dim=1).argmin()) for name in plan.devices]

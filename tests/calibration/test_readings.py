@@ -234,8 +234,8 @@ def test_what_is_refused() -> None:
     kept = good.rows(good.device != 1)
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}
-    names = ["rare"] * 4 + ["often"] * 56
-    with pytest.raises(MeasurementError, match="'rare' in 4 rows"):
+    names = ["rare"] * 3 + ["often"] * 57
+    with pytest.raises(MeasurementError, match="'rare' in 3 rows"):
         dc.calibrate(arm.nominal, dc.Readings.distances(good.q, good.values, names))
     with pytest.raises(MeasurementError, match="above 0"):
         dc.Readings.distances(good.q, -good.values)

@@ -40,8 +40,11 @@ def dense(regression: Regression) -> CholeskyRegression:
     return regression.conditional
 
 
-def factor(regression: Regression) -> Tensor:
-    return dense(regression).factor
+def matrix(regression: Regression) -> Tensor:
+    """G + R."""
+    factor = dense(regression).factor
+    H = factor.L @ factor.W
+    return factor.L @ factor.L.T + H @ H.T
 
 
 def around(problem: Problem) -> Regression:
@@ -61,7 +64,7 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
         + torch.block_diag(*problem.noise.covariance)
     )
     regression = tangent(problem)
-    torch.testing.assert_close(factor(regression) @ factor(regression).T, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(matrix(regression), expected, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
     mu = torch.linalg.solve(expected, (problem.y - k0).flatten()).reshape(problem.y.shape)
     torch.testing.assert_close(dense(regression).mu(regression.target), mu, rtol=1e-8, atol=1e-8)
@@ -90,7 +93,7 @@ def test_leave_one_out_around_a_deformation(problem: Problem) -> None:
     """The Gaussian conditional of each block given the remaining ones, for any linearisation."""
     regression = around(problem)
     n, m = regression.target.shape
-    covariance, target = factor(regression) @ factor(regression).T, regression.target.flatten()
+    covariance, target = matrix(regression), regression.target.flatten()
     for row in range(n):
         held = torch.arange(row * m, (row + 1) * m)
         kept = torch.tensor([k for k in range(n * m) if not row * m <= k < (row + 1) * m])

@@ -22,11 +22,10 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.regression import conditional
-from diffeo_calib.regression.cholesky import factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.regression.control_points import ControlPointRegression
-from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
 
 
 class MatrixOnly(Kernel):
@@ -56,8 +55,7 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
-    "cholesky": lambda problem, at: factorise(at.linearise(), problem.noise),
-    "explicit parameters": lambda problem, at: ExplicitParameterRegression(at.linearise(), problem.noise),
+    "cholesky": lambda problem, at: CholeskyRegression(at.linearise(), problem.noise),
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise),
 }
@@ -140,7 +138,7 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     torch.testing.assert_close(projected.rows(some).own_blocks(), blocks[some], rtol=1e-12, atol=1e-13)
     expected = naive_covariance(problem, data, queries)
     prior = float(naive_gram(queries, queries).diagonal().max())
-    close(factorise(data, problem.noise).covariance(queries), expected, prior, 1e-10)
+    close(CholeskyRegression(data, problem.noise).covariance(queries), expected, prior, 1e-10)
 
 
 @every_problem
@@ -175,11 +173,13 @@ def test_parameters_apart_are_the_formula(problem: Problem) -> None:
     at, x = deformed(problem), uniform(7, 2, seed=20)
     data, queries = (with_parameters(problem, at, points, 2.0) for points in (problem.x, x))
     expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
-    apart, together = ExplicitParameterRegression(data, problem.noise), factorise(data, problem.noise)
-    close(apart.covariance(queries), expected, prior, 1e-10)
-    close(together.covariance(queries), expected, prior, 1e-10)
-    values = normal(*problem.y.shape, 3, seed=8)
-    torch.testing.assert_close(apart.solve(values), together.solve(values), rtol=1e-6, atol=1e-6)
+    regression = CholeskyRegression(data, problem.noise)
+    close(regression.covariance(queries), expected, prior, 1e-10)
+    values, K = normal(len(data.gram()), 3, seed=8), data.gram() + torch.block_diag(*problem.noise.covariance)
+    solved = regression.solve(values.view(*problem.y.shape, 3)).flatten(0, 1)
+    torch.testing.assert_close(solved, torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
+    C = torch.stack([regression.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
+    torch.testing.assert_close(C.T @ K @ C, torch.eye(len(K), dtype=torch.float64), rtol=0, atol=1e-6)
 
 
 def test_wide_priors_do_not_cancel() -> None:
@@ -189,5 +189,5 @@ def test_wide_priors_do_not_cancel() -> None:
     found = []
     for wide in (1e8, 1e16):
         data, queries = (with_parameters(problem, at, points, wide) for points in (problem.x, x))
-        found.append(ExplicitParameterRegression(data, problem.noise).covariance(queries))
+        found.append(CholeskyRegression(data, problem.noise).covariance(queries))
     torch.testing.assert_close(found[0], found[1], rtol=1e-6, atol=1e-9 * float(found[1].abs().max()))

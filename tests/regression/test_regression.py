@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -17,8 +18,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
-from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
@@ -43,7 +43,8 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
-WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
+Way = Callable[[Problem, GeodesicDeformation], Any]
+WAYS: dict[str, Way] = {
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
         at.linearise(), problem.noise, rank=4
@@ -84,9 +85,7 @@ def test_linearisation_of_some_rows(problem: Problem) -> None:
 @pytest.mark.slow
 @every_way
 @every_problem
-def test_same_momenta_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
-) -> None:
+def test_same_momenta_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
     """Compared by their effect at the data, since flat directions of the momenta are rounding errors."""
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
@@ -98,12 +97,10 @@ def test_same_momenta_as_the_cholesky_factor(
 
 @every_way
 @every_problem
-def test_same_covariance_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
-) -> None:
+def test_same_covariance_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
     at = deformed(problem)
     queries = at.linearise(uniform(6, 2, seed=20))
-    expected = factorise(at.linearise(), problem.noise).covariance(queries)
+    expected = CholeskyRegression(at.linearise(), problem.noise).covariance(queries)
     actual = way(problem, at).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()) + 1e-9)
 
@@ -117,7 +114,7 @@ def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatc
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
-    expected = factorise(data, problem.noise).covariance(queries)
+    expected = CholeskyRegression(data, problem.noise).covariance(queries)
     monkeypatch.setattr(iterative, "MAX_EXACT_COORDINATES", 0)
     monkeypatch.setattr(iterative, "NEGLIGIBLE_VARIANCE_RATIO", 1e-9)
     scale = float(expected.abs().max())
@@ -158,7 +155,9 @@ def test_pivots_are_different_configurations_and_repeatable() -> None:
 
 
 @every_way
-def test_parameters_of_the_nominal_map(way: Callable[[Problem, GeodesicDeformation], Conditional]) -> None:
+def test_parameters_of_the_nominal_map(
+    way: Way,
+) -> None:
     """theta and its covariance by every method, for prior variances that differ from each other and from 1."""
     x = uniform(20, 2, seed=3)
     kernels = {"joint_kernel": dc.VonMises(1.0, 0.01), "task_kernel": dc.Gaussian(0.7, 0.01)}
@@ -204,7 +203,7 @@ def test_features_give_every_covariance(problem: Problem) -> None:
     at = deformed(problem)
     queries = at.linearise(uniform(6, problem.x.shape[1], seed=8))
     for conditional in (
-        choose.condition_for_covariances(at.linearise(), problem.noise),
+        choose.condition(at.linearise(), problem.noise),
         ControlPointRegression(at, problem.x, problem.noise),
     ):
         values, signs = conditional.features(queries)
@@ -239,3 +238,18 @@ def test_the_mode_needs_a_residual() -> None:
     problem = PROBLEMS["rr"]
     with pytest.raises(InputError, match="the mode of control points: expected their data's residual"):
         ControlPointRegression(deformed(problem), problem.x, problem.noise).mode()
+
+
+@pytest.mark.parametrize("way", [*WAYS, "cholesky"])
+def test_shifts_that_rows_share_are_parameters(way: str) -> None:
+    """cov(c) = (1 + Z^T (G + R)^-1 Z)^-1, with R the noise of the rows alone, and none with what knows nothing of c."""
+    problem = PROBLEMS["shared shifts"]
+    at, Z = deformed(problem), problem.noise.shared.flatten(0, 1)
+    lin, (m, c) = at.linearise(), problem.noise.shared.shape[1:]
+    conditional = CholeskyRegression(lin, problem.noise) if way == "cholesky" else WAYS[way](problem, at)
+    nothing = lin.rows(torch.tensor([0])).projected(torch.zeros(1, c, m, dtype=torch.float64))
+    K = lin.sensitivity.shape[2]
+    shifts = replace(nothing, sensitivity=torch.eye(K + c, dtype=torch.float64)[None, K:])
+    alone = lin.gram() + torch.block_diag(*problem.noise.covariance)
+    expected = torch.linalg.inv(torch.eye(c, dtype=torch.float64) + Z.T @ torch.linalg.solve(alone, Z))
+    torch.testing.assert_close(conditional.posterior(shifts)[0], expected, rtol=1e-3, atol=1e-9)

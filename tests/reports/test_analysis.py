@@ -39,7 +39,8 @@ def test_left_out_errors_are_those_of_a_model_without_the_row(name: str, request
     ((numbers, regression),) = rows.blocks
     target = rows.target[numbers]
     n, m = target.shape
-    whole = (regression.factor @ regression.factor.T).numpy().reshape(n, m, n, m)
+    L, W = regression.factor.L, regression.factor.W
+    whole = (L @ (torch.eye(len(L), dtype=torch.float64) + W @ W.T) @ L.T).numpy().reshape(n, m, n, m)
     for row in (0, 7, n - 1):
         others = np.delete(np.arange(n), row)
         inner = whole[others][:, :, others].reshape((n - 1) * m, -1)

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.process.factor import Factor
 from diffeo_calib.process.process import Process
+from diffeo_calib.regression.factor import Factor
 
 RELATIVE_RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""

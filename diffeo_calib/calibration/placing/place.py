@@ -24,7 +24,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherRows, Placement, Settled
+from diffeo_calib.calibration.placing.placement import OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
@@ -207,8 +207,7 @@ class Placed:
         """
         centre = chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
         here = torch.eye(4, dtype=centre.dtype, device=centre.device)
-        found = Settled(fitted.shifts, Tensor, slice(0), fitted_map, centre, here, chosen)
-        placement = self.placement.settled(fitted, found)
+        placement = self.placement.settled(fitted, fitted_map, centre, here, chosen=chosen)
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)
@@ -272,13 +271,13 @@ class Placed:
         coordinates, readings = divided(data)
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, readings, len(data), centre)
-        placement = Placement(tuple(one.with_rows(other) for one in self.placement))
+        placement = Placement(one.with_rows(other) for one in self.placement)
         if coordinates is not None:
             table = placement.aligned(coordinates.table)
             for one in placement:
                 table = one.at_places(table)
             coordinates = coordinates._replace(table=table)
-            placement = Placement(tuple(one.in_own_frame(table) for one in placement))
+            placement = Placement(one.in_own_frame(table) for one in placement)
         count = len(data if coordinates is None else coordinates.rows)
         tails = Tails.none(count, self.identification.tails.weights.shape[1])
         found = replace(self.identification, tails=tails)

@@ -9,9 +9,7 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -24,8 +22,6 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.choose import condition_for_covariances
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
@@ -72,8 +68,7 @@ class Settled(NamedTuple):
     """Result of a fit for the shifts of one set of devices.
 
     Args:
-        shifts: (c,) their posterior mean. joint: computes the covariance of the shifts of all sets. place: of this set
-            among them.
+        shifts: (c,) their posterior mean. covariance: (c, c).
         fitted: the map, its covariances without rigid motions if no device holds the frame.
         centre: (3,) the middle of the rows, m, in the frame of the devices, from which transform (4, 4) leads to that
             of the model.
@@ -82,18 +77,12 @@ class Settled(NamedTuple):
     """
 
     shifts: Tensor
-    joint: Callable[[], Tensor]
-    place: slice
+    covariance: Tensor
     fitted: FittedMap
     centre: Tensor
     transform: Tensor
     chosen: ChosenScales | None = None
     known: SetUps | None = None
-
-    @property
-    def covariance(self) -> Tensor:
-        """(c, c) of the shifts."""
-        return self.joint()[self.place, self.place]
 
 
 class DeviceSet(ABC):
@@ -184,91 +173,76 @@ class DeviceSet(ABC):
         return {}
 
 
-@dataclass(frozen=True)
-class Placement:
-    """All devices of a calibration.
-
-    Args:
-        sets: of one kind each.
-    """
-
-    sets: tuple[DeviceSet, ...] = ()
-
-    def __iter__(self) -> Iterator[DeviceSet]:
-        return iter(self.sets)
+class Placement(tuple[DeviceSet, ...]):
+    """All devices of a calibration, a set of each kind."""
 
     def one(self, kind: type[S]) -> S | None:
         """The first set of a kind; None without one."""
-        return next((own for own in self.sets if isinstance(own, kind)), None)
+        return next((own for own in self if isinstance(own, kind)), None)
 
     def hypotheses(self, data: Seen, *, said: bool) -> list[Hypothesis]:
         """What all devices are said to hold, or what of them may change."""
-        return [one for own in self.sets for one in own.hypotheses(data) if one.said == said]
+        return [one for own in self for one in own.hypotheses(data) if one.said == said]
 
     def sees(self, row: int, points: Tensor) -> Tensor:
         """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""
         views, found = self.views(), torch.ones(len(points), dtype=torch.bool, device=points.device)
-        for own in self.sets:
+        for own in self:
             found &= own.sees(row, points, views)
         return found
 
     def views(self) -> dict[str, View]:
         """Those of all devices, see :meth:`DeviceSet.views`."""
-        return {name: view for own in self.sets for name, view in own.views().items()}
+        return {name: view for own in self for name, view in own.views().items()}
 
     def measured_at(self, row: int, like: T, points: Tensor) -> T:
         """See :meth:`DeviceSet.measured_at`."""
         views = self.views()
-        for own in self.sets:
+        for own in self:
             like = own.measured_at(row, like, points, views)
         return like
 
     def places_at(self, row: int) -> Tensor | None:
         """See :meth:`DeviceSet.places_at`."""
-        return next((places for own in self.sets if (places := own.places_at(row)) is not None), None)
+        return next((places for own in self if (places := own.places_at(row)) is not None), None)
 
     def shared(self, data: Seen) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""
-        effects = [own.effects(data) for own in self.sets]
+        effects = [own.effects(data) for own in self]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(self, fitted: Fit, found: Settled, kind: type[DeviceSet] = DeviceSet) -> Placement:
-        """Those of a kind where a fit puts them, whose last shifts are those of all devices."""
-        joint, sets = cache(lambda: _covariance(found.fitted, fitted.model.noise)), list[DeviceSet]()
-        start = len(fitted.shifts) - sum(own.size for own in self.sets)
-        for own in self.sets:
-            part = slice(start, start + own.size)
-            there = found._replace(shifts=fitted.shifts[part], joint=joint, place=part)
-            sets += [own.settled(there)] if isinstance(own, kind) else []
-            start += own.size
-        return Placement(tuple(sets))
+    def settled(self, fitted: Fit, around: FittedMap, *at: Tensor, kind: Any = DeviceSet, **known: Any) -> Placement:
+        """Those of a kind where a fit puts them, whose last shifts are those of all devices.
+
+        Args:
+            fitted: the fit. around: its map, with the covariances of the model. at, known: see :class:`Settled`.
+        """
+        sets, parameters = list[DeviceSet](), len(around.geodesic.spec.prior_variance)
+        shifts, sizes = fitted.shifts, [own.size for own in self]
+        numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
+        for own, part in zip(self, numbers.split(sizes), strict=True):
+            if isinstance(own, kind):
+                covariance = around.parameter_covariance(parameters + part)
+                sets.append(own.settled(Settled(shifts[part], covariance, around, *at, **known)))
+        return Placement(sets)
 
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
-        for own in self.sets:
+        for own in self:
             data = own.aligned(data)
         return data
 
     def sentences(self) -> list[str]:
         """Where all devices are."""
-        return [line for own in self.sets for line in own.sentences()]
+        return [line for own in self for line in own.sentences()]
 
     def entry(self) -> dict[str, object]:
         """The same for programs."""
         found: dict[str, object] = {}
-        for own in self.sets:
+        for own in self:
             found |= own.entry()
         return found
 
     def placed(self) -> tuple[PlacedDevices, ...]:
         """Entries of all devices for the model file."""
-        return tuple(found for own in self.sets if (found := own.placed()) is not None)
-
-
-def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:
-    """Posterior covariance (c, c) of all shifts."""
-    at = fitted.geodesic.linearise(fitted.data)
-    at = at if fitted.slopes is None else at.projected(fitted.slopes)
-    alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
-    known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
-    return torch.linalg.inv(known + torch.eye(len(known), dtype=known.dtype, device=known.device))
+        return tuple(found for own in self if (found := own.placed()) is not None)

@@ -45,6 +45,7 @@ from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -262,7 +263,7 @@ class SocketDevices(DeviceSet):
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
             index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
-            ((errors, _),) = process.left_out([index])
+            errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
             predicted = data.y[rows, -3:] - errors.view(-1, 3)
@@ -431,15 +432,13 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     at = seen.geodesic.linearise(resting.q)
     last = torch.eye(seen.m, dtype=predicted.dtype, device=predicted.device)[-3:].expand(len(resting), -1, -1)
     own = seen.covariance_between(at.projected(last))
-    eye = torch.eye(3, dtype=own.dtype, device=own.device)
-    same = (socket[:, None] == socket).to(own)
-    K = own + torch.kron(PLACES.found_m_rad**2 * same, eye)
-    K = K + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1))
-    inverse = torch.linalg.inv(K)
-    mu = (inverse @ (middles - predicted).flatten()).view(-1, 3)
-    errors = torch.linalg.solve(diagonal_blocks(inverse, len(resting)), mu[..., None])[..., 0]
+    rests = torch.nn.functional.one_hot(socket).to(own)
+    places = torch.kron(PLACES.found_m_rad * rests, torch.eye(3, dtype=own.dtype, device=own.device))
+    factor = Factor.of(own + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1)), places)
+    mu = factor.solve((middles - predicted).view(-1, 1)).view(-1, 3)
+    errors = torch.linalg.solve(diagonal_blocks(factor.inverse, len(resting)), mu[..., None])[..., 0]
     squares = (mu * errors).sum(1)
-    judged = same.sum(1) > FEWEST_BESIDE
+    judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
         return []
     size = float(squares[judged].median()) / chi2_median(3)

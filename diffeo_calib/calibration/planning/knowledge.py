@@ -339,7 +339,9 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     whole = torch.cat(values, 1)
     new = len(whole) - len(signs)
     if fitted.noise.shared.shape[2] and registration is None:
-        whole = torch.cat([whole, torch.nn.functional.pad(conditional.shift_features(), (0, 0, 0, new))], 1)
+        K, c = len(fitted.geodesic.spec.prior_variance), fitted.noise.shared.shape[2]
+        shifts = conditional.features(fitted.parameters_as_points(K + torch.arange(c, device=whole.device))).values
+        whole = torch.cat([whole, torch.nn.functional.pad(shifts, (0, 0, 0, new))], 1)
     own = Known(Linearisation.joined(parts), whole, torch.cat([signs, signs.new_ones(new)]))
     along = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
     return Start(own, Scene(torch.cat(points), *along, seen, adrift, own.shifts))

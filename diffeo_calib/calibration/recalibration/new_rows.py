@@ -356,7 +356,7 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
         numbers = torch.arange(table.values.shape[1], device=own.device)
         readings.append(ReadingDevices(table, fitting_devices(table, points[own]), own, numbers))
     if told is not None and noise is not None and len(told.rows) == len(seen):
-        return told.noise_model, noise, {"y": told.y, "placement": Placement(tuple(sets))}
+        return told.noise_model, noise, {"y": told.y, "placement": Placement(sets)}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
     old = before.fitted.noise

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.findings import parts
-from diffeo_calib.calibration.placing.placement import Placement, Settled
+from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
@@ -268,8 +268,8 @@ def _with_settled(
     """The devices, set-ups where the fit puts them."""
     first = len(fitted.problem.y) - len(rows)
     at = fitted.model, rows.centre, place.transform
-    found = Settled(fitted.shifts, Tensor, slice(0), *at, known=mounted_of(model))
-    each = [own.placed() for own in rows.placement.settled(fitted, found, Sessions) if isinstance(own, Sessions)]
+    found = rows.placement.settled(fitted, *at, kind=Sessions, known=mounted_of(model))
+    each = [own.placed() for own in found if isinstance(own, Sessions)]
     settled = {own.kind: replace(own, rows=own.rows + first) for own in each}
     return tuple(settled[own.kind].beside(own) if own.kind in settled else own for own in placement)
 

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.differing_noise import noise_of_new_rows
+from diffeo_calib.calibration.scales.leave_one_out import left_out_rows
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
@@ -89,7 +90,7 @@ def cross_validated_inflation(
     rows, data = data.sample(len(data.x), limits.coordinates, seed)
     numbers, new = motions(data.x, groups[rows], limits), new[rows]
     if centre is None or len(numbers[new].unique()) >= limits.outside:
-        squares = left_out_squares(data, scales, [(numbers == k).nonzero()[:, 0] for k in numbers[new].unique()])
+        squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
         squares[~new] = nan
     else:
         found = _squares_of_folds(centre, scales, data, numbers, seed=seed, limits=limits, progress=progress)
@@ -122,8 +123,8 @@ def _squares_of_folds(
             again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
             if again.interrupted:
                 return None
-            parts = [(numbers == k).nonzero()[:, 0] for k in numbers[rows].unique()]
-            squares[rows] = left_out_squares(data, again.scales, parts)[rows]
+            part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
+            squares[rows] = left_out_squares(data, again.scales, part)[rows]
     except KeyboardInterrupt:
         return None
     return squares
@@ -144,12 +145,11 @@ def inflation_by_places(
         groups: (N,) a number for each configuration, the same for its repeats.
     """
     process, owner = data.process(scales), data.numbers.owner
-    total, count, places = 0.0, 0, place[place >= 0].unique()
-    groups_of_numbers = [(place[owner] == number).nonzero()[:, 0] for number in places]
-    for number, index, (errors, _) in zip(places, groups_of_numbers, process.left_out(groups_of_numbers), strict=True):
-        total += float(errors @ process.mu[index])
-        count += len(index) - 3 * len(shared[place == number].unique())
-    units = max(len(places), FEWEST_PLACES) + len(groups[place < 0].unique())
+    resting, errors = place >= 0, process.left_out(place[owner])[0]
+    total = float((errors * process.mu).nansum())
+    sockets = len(torch.stack([place, shared], 1)[resting].unique(dim=0))
+    count = int(resting[owner].sum()) - 3 * sockets
+    units = max(len(place[resting].unique()), FEWEST_PLACES) + len(groups[~resting].unique())
     return max(total / max(count, 1), 1.0) * region_factor(units, 3)
 
 
@@ -185,27 +185,9 @@ def motions(x: Tensor, groups: Tensor, limits: FoldLimits = LIMITS) -> Tensor:
     return found if int(found.max()) + 1 >= limits.fewest_motions else groups.unique(return_inverse=True)[1]
 
 
-def left_out_squares(data: TangentData, scales: Hyperparameters, parts: list[Tensor]) -> Tensor:
-    """Squared errors of rows predicted without their part, in units of the covariance predicted for a new row.
+def left_out_squares(data: TangentData, scales: Hyperparameters, part: Tensor) -> Tensor:
+    """Squared errors (N, bodies) of rows predicted without their part (N,), in units of those predicted for new rows.
 
-    With A the block of (G + R)^-1 that belongs to a part, its errors are A^-1 mu with the covariance A^-1.
-
-    Args:
-        data: the measurements. scales: held fixed. parts: row numbers of each part that is left out.
-
-    Returns:
-        (N, bodies); NaN for hidden markers, and for rows of no part.
+    NaN for hidden markers, and for rows of no part.
     """
-    new, data = data.blocks_in_numbers(noise_of_new_rows(data, scales)), data.told
-    numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
-    part = torch.full((len(data.x),), -1, dtype=torch.long, device=data.x.device)
-    for number, rows in enumerate(parts):
-        part[rows] = number
-    groups = [(part[numbers.owner] == number).nonzero()[:, 0] for number in range(len(parts))]
-    errors, covariance = torch.full_like(numbers.target, nan), torch.zeros_like(process.inverse)
-    for group, (error, own_covariance) in zip(groups, process.left_out(groups), strict=True):
-        errors[group] = error
-        covariance[group[:, None], group] = own_covariance
-    e = numbers.in_table(errors)[:, :, None]
-    predicted = numbers.blocks_in_table(numbers.diagonal_blocks(covariance)) - own + new
-    return data.noise_model.squares(torch.where(part[:, None, None] < 0, own, predicted), e @ e.mT)
+    return left_out_rows(data.told, scales, part, data.blocks_in_numbers(noise_of_new_rows(data, scales)))[1]

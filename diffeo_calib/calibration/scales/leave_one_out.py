@@ -142,8 +142,12 @@ def leave_one_out(
     errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
     effective = []
     for rows, part in _parts(told, seed, block_coordinates):
-        errors[rows], squares[rows], number = _left_out(part, scales)
-        effective.append(number)
+        every = torch.arange(len(rows), device=rows.device)
+        errors[rows], squares[rows] = left_out_rows(part, scales, every, part.noise(scales))
+        inverse = part.numbers.diagonal_blocks(part.process(scales).inverse)
+        own = part.numbers.blocks_of_table(part.weighted_noise(scales))
+        noise = float(sum((one * block).sum() for one, block in zip(own, inverse, strict=True)))
+        effective.append(part.coordinates - noise)
     errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
 
@@ -176,12 +180,16 @@ def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) 
     return data.noise_model.squares(data.noise(scales), moments)
 
 
-def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:
-    """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
-    numbers, process, noise = data.numbers, data.process(scales), data.weighted_noise(scales)
-    blocks, own = numbers.diagonal_blocks(process.inverse), numbers.blocks_of_table(noise)
-    covariance = numbers.blocks_in_table([torch.linalg.inv(block) for block in blocks])  # with the row's own noise
-    error = covariance @ numbers.in_table(process.mu)[:, :, None]
-    effective = len(process.mu) - float(sum((one * block).sum() for one, block in zip(own, blocks, strict=True)))
-    squares = data.noise_model.squares(covariance - noise + data.noise(scales), error @ error.mT)
-    return error[:, :, 0], squares, effective
+def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors (N, m) of rows predicted without their part, and their squared distances (N, bodies).
+
+    Args:
+        data: the measurements. scales: held fixed. part: (N,) that is left out with each row; negative for none: NaN.
+        new: (N, m, m) noise of a new measurement like each row, whose predicted covariance is the unit of squares.
+    """
+    numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
+    errors, covariance = process.left_out(part[numbers.owner])
+    errors = numbers.in_table(errors)
+    predicted = numbers.blocks_in_table(numbers.diagonal_blocks(covariance)) - own + new
+    predicted = torch.where(part[:, None, None] < 0, own, predicted)
+    return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])

@@ -28,7 +28,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.measurements.bodies import seen_board
@@ -182,51 +181,33 @@ class NoiseModel:
         mean = self._of_all(scales, jacobian).mean(0)
         seen = self.coordinates(jacobian[..., 0])
         if self.modes is not None and self.visible is not None:  # modes of hidden poses are not known
-            own = self._of_poses(scales, jacobian)
+            own = self._of_poses(self.modes, scales, jacobian.shape[1])
             mean = mean - own.mean(0) + mean_block(own, seen)
         return mean if self.known is None else mean + mean_block(self.known, seen)
 
     def _of_all(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without what is known, as if everything were visible."""
-        count = jacobian.shape[1]
-        eye = torch.eye(count, dtype=jacobian.dtype, device=jacobian.device)
-        total = jacobian * scales.joint_noise.square() @ jacobian.mT + self.smallest_noise**2 * eye
-        if self.modes is None:
-            return total + self._of_points(scales, eye)
-        if self.modes.shape[1] == self.bodies and self.kinds is None:
-            return total + self._of_poses(scales, jacobian) + self.slack**2 * eye
-        posed = self._posed(count)[:, :, None]
-        single = self._of_points(scales, eye) * ~posed
-        return total + self._of_poses(scales, jacobian) + self.slack**2 * eye * posed + single
+        levels = scales.sensor_noise.reshape(1)
+        levels = levels if scales.other_noise is None else torch.cat([levels, scales.other_noise.reshape(-1)])
+        kinds = self.kinds
+        if kinds is None:
+            kinds = torch.zeros(1, self.bodies, dtype=torch.int64, device=jacobian.device)
+        single = levels.square()[kinds.clamp(max=len(levels) - 1)]
+        if self.modes is not None:
+            posed = (torch.arange(self.bodies, device=kinds.device) < self.modes.shape[1]) & (kinds == 0)
+            single = torch.where(posed, self.slack**2, single)
+        single = (single + self.smallest_noise**2).repeat_interleave(jacobian.shape[1] // self.bodies, 1)
+        total = jacobian * scales.joint_noise.square() @ jacobian.mT + torch.diag_embed(single)
+        return total if self.modes is None else total + self._of_poses(self.modes, scales, jacobian.shape[1])
 
-    def _posed(self, count: int) -> Tensor:
-        """(N, R) boolean: the numbers of poses."""
-        if self.modes is None:
-            return torch.zeros(1, count, dtype=torch.bool, device=HOST)
-        posed = torch.arange(self.bodies, device=self.modes.device)[None] < self.modes.shape[1]
-        posed = posed if self.kinds is None else posed & (self.kinds == 0)
-        return posed.repeat_interleave(count // self.bodies, 1)
-
-    def _of_points(self, scales: Hyperparameters, eye: Tensor) -> Tensor:
-        """Independent noise of every number: (R, R), or (N, R, R) with several kinds of devices."""
-        if self.kinds is None or scales.other_noise is None:
-            return scales.sensor_noise**2 * eye
-        levels = torch.cat([scales.sensor_noise.reshape(1), scales.other_noise.reshape(-1)]).square()
-        own = levels[self.kinds].repeat_interleave(len(eye) // self.bodies, 1)
-        return torch.diag_embed(own)
-
-    def _of_poses(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
-        """Covariance (N, R, R) of the shifts and turns of poses."""
-        N, R, _ = jacobian.shape
-        if self.modes is None:
-            return jacobian.new_zeros(N, R, R)
+    def _of_poses(self, modes: Tensor, scales: Hyperparameters, count: int) -> Tensor:
+        """Covariance (N, R, R) of the shifts and turns of poses among R = ``count`` numbers."""
         size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
-        own = (self.modes * size.square()) @ self.modes.mT
+        own = (modes * size.square()) @ modes.mT
         if self.kinds is not None:
             own = own * (self.kinds == 0)[:, : own.shape[1], None, None]
         own = block_diagonal(own)
-        rest = R - own.shape[1]
-        return own if rest == 0 else torch.nn.functional.pad(own, (0, rest, 0, rest))
+        return torch.nn.functional.pad(own, (0, count - own.shape[1]) * 2)
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
         """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""

@@ -10,16 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.process.scales import (
-    DEVIATIONS,
-    SCALES,
-    GearLine,
-    Hyperparameters,
-)
+from diffeo_calib.process.scales import DEVIATIONS, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
 
@@ -49,7 +43,7 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
         models: see :func:`check_models`.
         like: the defaults, of which the noise of further devices is kept.
     """
-    vectors = torch.stack([_vector(model) for model in models]).to(like.sensor_noise)
+    vectors = torch.stack([model.scales for model in models if model.scales is not None]).to(like.sensor_noise)
     deviations = torch.cat(
         [torch.full_like(getattr(like, name).reshape(-1), name in DEVIATIONS, dtype=torch.bool) for name in SCALES]
     )
@@ -57,12 +51,6 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
     share = len(models) ** -0.5
     lines = tuple(replace(line, amplitude=share * line.amplitude) for model in models for line in _lines(model))
     return replace(like.with_vector(mean), lines=lines)
-
-
-def _vector(model: CalibratedKinematics) -> Tensor:
-    if model.scales is None:
-        raise InputError.of("a model of `scales_of`", expected="scales", got="none")
-    return model.scales
 
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:

@@ -21,8 +21,8 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.process.factor import Factor
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
+from diffeo_calib.regression.factor import Factor
 
 MESHING_LENGTHSCALE_RAD = 0.22
 """Default length scale of the transmission kernels on a circle: meshing of a reduction gear."""
@@ -127,17 +127,14 @@ def select(
             search.best = start  # until better scales are found
             search.climb([start], limits.iterations)
         else:
-            starts = [_with_transmission(centre, lengthscale) for lengthscale in TRANSMISSION_STARTS_RAD]
+            usual = centre.transmission_lengthscale
+            factors = [one / MESHING_LENGTHSCALE_RAD for one in TRANSMISSION_STARTS_RAD]
+            starts = [replace(centre, transmission_lengthscale=usual * factor) for factor in factors]
             search.climb(starts, limits.first_iterations(subset.target.numel()))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
     return Selection(search.best, status, likelihood=search.best_likelihood)
-
-
-def _with_transmission(scales: Hyperparameters, lengthscale: float) -> Hyperparameters:
-    factor = lengthscale / MESHING_LENGTHSCALE_RAD
-    return replace(scales, transmission_lengthscale=scales.transmission_lengthscale * factor)
 
 
 class LogPosterior(NamedTuple):
@@ -201,19 +198,16 @@ class _Search:
 
     def climb(self, starts: Sequence[Hyperparameters], iterations: int) -> None:
         """Run the optimiser from each start."""
-        self.total = len(starts) * iterations
-        for number, start in enumerate(starts):
-            self.done, self.ends = number * iterations, (number + 1) * iterations
-            self._climb(start, iterations)
-
-    def _climb(self, start: Hyperparameters, iterations: int) -> None:
         from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
         origin, reach = self.centre.logarithms().numpy(), self.limits.log_range
         bounds = list(zip(origin - reach, origin + reach, strict=True))
-        x0 = start.logarithms().numpy().clip(origin - reach, origin + reach)
-        with torch_alone():
-            minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
+        options, self.total = {"maxiter": iterations}, len(starts) * iterations
+        for number, start in enumerate(starts):
+            self.done, self.ends = number * iterations, (number + 1) * iterations
+            x0 = start.logarithms().numpy().clip(origin - reach, origin + reach)
+            with torch_alone():
+                minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus the log posterior and its gradient, for scipy."""

@@ -128,7 +128,7 @@ def _lines_about_places(
     if any(one.one.what == ERRORS for one in (held_out or {}).values()):  # else they are the verdict
         yield stage_line(result.model, result.stages, result.expected)
     yield from expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (one.size_advice() for one in result.placement.sets)), None)
+    advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"

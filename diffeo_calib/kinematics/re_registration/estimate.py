@@ -33,7 +33,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.re_registration.session import Place
 from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.process.factor import Factor
+from diffeo_calib.regression.factor import Factor
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 

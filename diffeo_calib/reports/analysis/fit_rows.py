@@ -26,9 +26,7 @@ from diffeo_calib.kinematics.nominal import SessionMarkers
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
-from diffeo_calib.regression.conditional import DataConditional
-from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
 WHOLE_COORDINATES = 4500
 """Measured coordinates up to which each row is predicted by all others."""
@@ -114,7 +112,7 @@ class FitRows:
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = order.tensor_split(ceil(n * m / BLOCK_COORDINATES))
         parts = [part.sort().values for part in parts]
-        return [(rows, factorise(self._linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
+        return [(rows, CholeskyRegression(self._linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
@@ -124,7 +122,7 @@ class FitRows:
         """
         whole, noise = self._predictor, self.map.noise
         every = torch.arange(len(self), device=self.target.device)
-        parts = [(every, whole)] if isinstance(whole, ExplicitParameterRegression) else self.blocks
+        parts = [(every, whole)] if len(whole.linearisation.sensitivity) == len(self) else self.blocks
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
         for rows, regression in parts:
             errors[rows], own = regression.left_out(self.target[rows])
@@ -139,10 +137,10 @@ class FitRows:
         Subsets are drawn at random from one block; the last number is that of all
         rows that predict one. Outliers keep their small weights and do not count as errors.
         """
-        rows, regression = self.blocks[0]
+        rows = self.blocks[0][0]
         target = self.target[rows]
         n, m = target.shape
-        matrix = regression.matrix()
+        matrix = self.map.noise.rows(rows).add_to(self._linearised[1].rows(rows).gram())
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
         good, seen = self._inliers(rows), self.map.noise.visible[rows]
         sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]
@@ -196,10 +194,10 @@ class FitRows:
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property
-    def _predictor(self) -> DataConditional:
+    def _predictor(self) -> CholeskyRegression:
         """The model conditioned on all rows, which the map has at hand; of very many, on those of one block."""
         whole = self.map.conditional if self.whole else None
-        return whole if isinstance(whole, ExplicitParameterRegression) else self.blocks[0][1]
+        return whole if isinstance(whole, CholeskyRegression) else self.blocks[0][1]
 
     @cached_property
     def target(self) -> Tensor:

@@ -42,9 +42,25 @@ class Factor:
 
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 values (M, k)."""
+        return self.solved(values)[0]
+
+    def solved(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """K^-1 values (M, k) and H^T K^-1 values (K, k), in which nothing cancels."""
         white = torch.linalg.solve_triangular(self.L, values, upper=False)
-        white = white - self.W @ torch.cholesky_solve(self.W.T @ white, self.B)
-        return torch.linalg.solve_triangular(self.L.T, white, upper=True)
+        shift = torch.cholesky_solve(self.W.T @ white, self.B)
+        return torch.linalg.solve_triangular(self.L.T, white - self.W @ shift, upper=True), shift
+
+    def of_white(self, values: Tensor) -> Tensor:
+        """C values (M,) with C C^T = K^-1: L^-T (1 + W W^T)^-1/2 values."""
+        U, less = self._root
+        white = values - U @ (less * (U.T @ values))
+        return torch.linalg.solve_triangular(self.L.T, white[:, None], upper=True)[:, 0]
+
+    @cached_property
+    def _root(self) -> tuple[Tensor, Tensor]:
+        """U and d with (1 + W W^T)^-1/2 = 1 - U diag(d) U^T."""
+        U, deviations, _ = torch.linalg.svd(self.W, full_matrices=False)
+        return U, 1.0 - (1.0 + deviations.square()).rsqrt()
 
     @cached_property
     def inverse(self) -> Tensor:
