@@ -31,6 +31,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.rows import with_attributes
@@ -364,7 +365,7 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
 
 
 def _reading(own: Any) -> str:
-    if own.kind == "corners":
+    if isinstance(own, ImageColumns):
         size = own.camera if isinstance(own.camera, tuple) else own.camera["left"]
         return f"corners={size[0]},{size[1]}"
     names = ",".join(own.values) if isinstance(own.values, tuple) else str(own.values)
