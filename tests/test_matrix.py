@@ -297,7 +297,7 @@ def _(bench: Bench) -> None:
 
     numbered_anew = ("two cameras", "two cameras on the tool")  # in the order in which a table's rows show them
     shared = kind.name not in (*THROUGHOUT, *numbered_anew)
-    if shared:
+    if shared and kind.registered:  # made before it is replaced
         bench.command.monkeypatch.setattr(dc.CalibratedKinematics, "registered", registered)
     bench.run("evaluate", kind.file, table, *options, "--register", "-o", path)
     model: Any = dc.load(path)
