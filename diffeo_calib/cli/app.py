@@ -146,7 +146,6 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
 
         def run(_json: Any, **given: Any) -> None:
             made = _made(options, given)
-            made.check()
             files: dict[str, dict[str, Path]] = {"write": dict(made.beside), "read": {}, "appended": {}, "folder": {}}
             for key, (_, field) in leaves.items():
                 for path in given[key] if isinstance(given[key], list) else [given[key]]:
@@ -154,6 +153,7 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
                         shown = names_of(field)[0] + f" {path}" * isinstance(given[key], list)
                         files[field.metadata["file"]][shown] = path
             check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
+            made.check()
             import_module(f"diffeo_calib.cli.commands.{name}").run(made)
 
         json = inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json)

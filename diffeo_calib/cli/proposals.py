@@ -391,8 +391,9 @@ def deviations(source: Source) -> Iterator[Choice]:
     names = guess_deviations(source.numbers, source.rows.markers)
     if names is None:
         return
-    found = measured_positions(source.read(source.table))
-    with suppress(DiffeoCalibError):
+    found = None
+    with warnings.catch_warnings(), suppress(DiffeoCalibError):
+        warnings.simplefilter("ignore")
         found = measured_positions(source.read(replace(source.table, std=names)))
     if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
         yield Choice("", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used")

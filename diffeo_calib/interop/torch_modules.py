@@ -19,6 +19,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.flow import Operations
+from diffeo_calib.runtime.tables import TURN
 
 
 class Constants(nn.Module):
@@ -50,6 +51,10 @@ def rigid_inverse(poses: Tensor) -> Tensor:
     return torch.cat([top, poses[..., 3:, :]], -2)
 
 
+def _within_turn(x: Tensor) -> Tensor:
+    return x - TURN * torch.floor(x * (1.0 / TURN))
+
+
 def _at_least(values: Tensor, floor: float) -> Tensor:
     return values.clamp(min=floor)
 
@@ -75,6 +80,6 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
 
 
 TORCH = Operations(
-    *(torch.sin, torch.cos, torch.floor, torch.stack, torch.cat, torch.ones_like, torch.broadcast_to),
+    *(torch.sin, torch.cos, _within_turn, torch.stack, torch.cat, torch.ones_like, torch.broadcast_to),
     *(_at_least, _profile, _cells_around, _combined, twist_transform, rigid_inverse),
 )

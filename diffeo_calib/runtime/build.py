@@ -374,7 +374,8 @@ def radial_term(config: Mapping[str, Any], stages: Array) -> RadialTerm:
     centre = x.mean(axis=(0, 1))
     parts = (x - centre) * scales[:L], np.cos(angles) * scales[L:], np.sin(angles) * scales[L:]
     F = np.concatenate(parts, axis=-1)  # (S, C, D)
-    right = np.concatenate([-2.0 * F, np.ones_like(F[..., :1]), (F * F).sum(-1, keepdims=True)], axis=-1)
+    square = (F * F).sum(-1, keepdims=True) + (scales[L:] ** 2).sum()  # and that of any point on the circles
+    right = np.concatenate([-2.0 * F, square], axis=-1)
     right = np.ascontiguousarray(right.swapaxes(1, 2))
     indices = as_index(lines), as_index(circles)
     return RadialTerm(config["profile"], *indices, scales, centre, right, stages[:, 1] * amplitude)

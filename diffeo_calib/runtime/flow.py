@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, transforms
-from diffeo_calib.runtime.tables import PROFILES, JointTables, cells_around, tabulated
+from diffeo_calib.runtime.tables import PROFILES, JointTables, cells_around, tabulated, within_turn
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""
@@ -34,7 +34,7 @@ class RadialTerm:
         lines, circles: columns of x that it depends on, as indices.
         scales: (lines + circles,) inverse length scales, lines first.
         centre: (lines,) of the controls on the lines: differences of far points would lose digits.
-        right: (S, D + 2, C): (F, |F|^2, 1) times it is the squared distance from the controls.
+        right: (S, D + 1, C): (F, 1) times it, plus |F|^2 of the lines, is the squared distance from the controls.
         weights: (S, C, n) their momenta times the kernel's output matrix.
     """
 
@@ -54,7 +54,7 @@ class RadialTerm:
     @property
     def features(self) -> Array:
         """(S, C, D) F of the controls."""
-        return -0.5 * self.right[:, :-2].swapaxes(1, 2)
+        return -0.5 * self.right[:, :-1].swapaxes(1, 2)
 
     def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
         """(N, n) -> v (N, n), Dv (N, n, n).
@@ -142,7 +142,7 @@ class RecordedFlow:
 
 def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:
     """x + sum_k c_k slope_k."""
-    for c, slope in zip(coefficients, slopes, strict=False):
+    for c, slope in zip(np.asarray(coefficients).tolist(), slopes, strict=False):
         if c:
             x = x + c * slope
     return x
@@ -151,13 +151,14 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
 class Operations(NamedTuple):
     """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_modules.py.
 
-    ``profile`` is a radial function by its name, ``at_least`` the larger of values and a number, ``combined`` the state
-    at a Runge-Kutta stage, ``cells_around`` that of tables.py, ``inverse`` of rigid transforms.
+    ``within_turn`` are angles in [0, 2 pi), ``profile`` is a radial function by its name, ``at_least`` the larger of
+    values and a number, ``combined`` the state at a Runge-Kutta stage, ``cells_around`` that of tables.py, ``inverse``
+    of rigid transforms.
     """
 
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
-    floor: Callable[[Any], Any]
+    within_turn: Callable[[Any], Any]
     stack: Callable[[Any, int], Any]
     concatenate: Callable[[Any, int], Any]
     ones_like: Callable[[Any], Any]
@@ -179,7 +180,7 @@ def _at_least(values: Array, floor: float) -> Array:
 
 
 NUMPY = Operations(
-    *(np.sin, np.cos, np.floor, np.stack, np.concatenate, np.ones_like, np.broadcast_to),
+    *(np.sin, np.cos, within_turn, np.stack, np.concatenate, np.ones_like, np.broadcast_to),
     *(_at_least, _profile, cells_around, combined, transforms, np.linalg.inv),
 )
 
@@ -201,14 +202,19 @@ def _velocities(flow: Any, stage: int, x: Any, use: Operations) -> Iterator[Any]
     for term in flow.terms:
         yield use.profile(term.profile, squared_distances(term, stage, x, use)[1]) @ term.weights[stage]
     if flow.tables is not None:
-        yield tabulated(flow.tables, stage, x, use.floor, use.cells_around)[0] @ flow.tables.selection
+        yield tabulated(flow.tables, stage, x, use.within_turn, use.cells_around)[0] @ flow.tables.selection
 
 
 def squared_distances(term: Any, stage: int, x: Any, use: Operations) -> tuple[Any, Any]:
     """Features F of points: lines about the controls' centre, cosines, sines (N, D); |F - F_j|^2 (N, C)."""
-    L, angles = len(term.centre), x[..., term.circles]
-    lines = (x[..., term.lines] - term.centre) * term.scales[:L]
-    F = use.concatenate([lines, use.cos(angles) * term.scales[L:], use.sin(angles) * term.scales[L:]], -1)
-    square = (F * F).sum(-1)[..., None]
-    r2 = use.concatenate([F, square, use.ones_like(square)], -1) @ term.right[stage]
-    return F, use.at_least(r2, SMALLEST_SQUARE)
+    L, parts = len(term.centre), []
+    if L:
+        parts.append((x[..., term.lines] - term.centre) * term.scales[:L])
+    if len(term.scales) > L:
+        angles = x[..., term.circles]
+        parts += [use.cos(angles) * term.scales[L:], use.sin(angles) * term.scales[L:]]
+    F = use.concatenate([*parts, use.ones_like(x[..., :1])], -1)
+    r2 = F @ term.right[stage]
+    if L:
+        r2 = r2 + (parts[0] * parts[0]).sum(-1)[..., None]
+    return F[..., :-1], use.at_least(r2, SMALLEST_SQUARE)

@@ -192,23 +192,29 @@ class JointTables:
 
     def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
         """f of every joint in its component (N, n), and the derivative of the interpolated f, (N, n, n)."""
-        value, u, c = tabulated(self, stage, x, np.floor, cells_around)
+        value, u, c = tabulated(self, stage, x, within_turn, cells_around)
         slope = (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
         return value @ self.selection, (slope @ self.selection)[..., None] * np.eye(x.shape[1])
 
 
 def tabulated(
-    tables: Any, stage: int, x: Any, floor: Callable[[Any], Any], around: Callable[[Any, Any, Any], Any]
+    tables: Any, stage: int, x: Any, within: Callable[[Any], Any], around: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, Any, list[Any]]:
     """f of every joint (N, L) at x (N, n), the distances (N, L) from the knots, and the coefficients there.
 
     Args:
-        tables: the constants of :class:`JointTables`, as arrays of a library. floor: of it. around: as cells_around.
+        tables: the constants of :class:`JointTables`, as arrays of a library. within, around: of it, as
+            within_turn and cells_around.
     """
-    angle = x[..., tables.joints]
-    t = angle - TURN * floor(angle * (1.0 / TURN)) + tables.shifts
+    t = within(x[..., tables.joints]) + tables.shifts
     start, *c = around(tables.starts[stage], tables.cells[stage], t)
-    return _quintic(c, t - start), t - start, c
+    u = t - start
+    return _quintic(c, u), u, c
+
+
+def within_turn(x: Array) -> Array:
+    """Angles in [0, 2 pi)."""
+    return np.mod(x, TURN)
 
 
 def cells_around(starts: Array, cells: Array, t: Array) -> Array:

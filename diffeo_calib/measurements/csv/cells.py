@@ -14,7 +14,7 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -64,7 +64,8 @@ class CsvLines:
             self._file = stack.enter_context(self._open())
             if not self._file.seekable():
                 copy = stack.enter_context(tempfile.TemporaryFile("w+", encoding="utf-8", newline=""))
-                copy.writelines(self._texts())
+                with self._read():
+                    copy.writelines(self._texts())
                 self._file = copy
             header = next(self._cells(), None)
             if header is None:
@@ -109,18 +110,24 @@ class CsvLines:
         line = 0
         reader = csv.reader(self._texts(), delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
         try:
-            for cells in reader:
-                first, line = line + 1, reader.line_num  # a quoted cell may span lines
-                stripped = [cell.strip() for cell in cells]
-                if len(stripped) > 1 or any(stripped):
-                    yield first, stripped
+            with self._read():
+                for cells in reader:
+                    first, line = line + 1, reader.line_num  # a quoted cell may span lines
+                    stripped = [cell.strip() for cell in cells]
+                    if len(stripped) > 1 or any(stripped):
+                        yield first, stripped
+        except csv.Error as error:
+            what = f"file '{self.path}', line {line + 1}: not valid CSV ({error})"
+            raise MeasurementError.of(what, fix="repair the quotes of this line") from error
+
+    @contextmanager
+    def _read(self) -> Iterator[None]:
+        try:
+            yield
         except UnicodeDecodeError as error:
             fix = "save the table as CSV with UTF-8 encoding (a spreadsheet file cannot be read)"
             what = f"file '{self.path}' is not UTF-8 text"
             raise MeasurementError.of(what, expected="a CSV file", fix=fix) from error
-        except csv.Error as error:
-            what = f"file '{self.path}', line {line + 1}: not valid CSV ({error})"
-            raise MeasurementError.of(what, fix="repair the quotes of this line") from error
         except OSError as error:
             what = f"file '{self.path}' cannot be read to its end ({error.strerror})"
             raise MeasurementError.of(what, fix="copy it to another disk first") from error
@@ -318,9 +325,10 @@ def fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidd
         hidden = [all(_EMPTY.fullmatch(cells[k]) for k in own.values) for own in hideable]
         if all(hidden) and not all_hidden:
             continue  # no marker at all: a mistake
+        kept = {k for own, gone in zip(hideable, hidden, strict=True) if not gone for k in own.deviations}
         for own, gone in zip(hideable, hidden, strict=True):
             for column in (*own.values, *own.deviations) if gone else ():
-                if column in own.values or _EMPTY.fullmatch(cells[column]):
+                if column in own.values or (column not in kept and _EMPTY.fullmatch(cells[column])):
                     cells[column] = "0"
                     filled.append((number_of_row, column))
     return filled

@@ -79,7 +79,7 @@ class Group(NamedTuple):
 
     @property
     def _per_si(self) -> float:
-        return self.unit if isinstance(self.unit, float) else UNITS_PER_METRE.get(self.unit or "", 1.0)
+        return self.unit if isinstance(self.unit, (int, float)) else UNITS_PER_METRE.get(self.unit or "", 1.0)
 
 
 class Reported(NamedTuple):

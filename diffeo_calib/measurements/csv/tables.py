@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -29,9 +28,6 @@ from diffeo_calib.measurements.csv.cells import (
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.poses import LEVER
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
@@ -162,7 +158,7 @@ class TableFile(CsvLines):
         wanted, decimal, hideable = self.columns.names, self.columns.table.decimal, self.columns.hideable
         named = [name for name, needed in self.texts.items() if needed or name in self.header]
         places = find_columns(self.path, self.header, [*wanted, *named], self.sep)
-        mistakes = Mistakes(self.path, wanted, decimal, markers=len(hideable))
+        mistakes = Mistakes(self.path, wanted, decimal, markers=len(self.columns.triples))
         for lines in self.blocks(ROWS_AT_ONCE):
             whole = mistakes.without_ragged(lines, len(self.header))
             cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]

@@ -17,9 +17,9 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
-from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Group, check_count, position_triples
-from diffeo_calib.measurements.csv.images import written_columns
+from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers
@@ -225,9 +225,12 @@ def write_measurements(
     columns = replace(columns, joints=names, kinds=kinds)
     numeric = columns.numeric(table)
     check_count("joint columns", numeric.joints, whole.n, "joint")
-    twice = {*numeric.names} & {*columns.texts}
+    sockets = () if columns.sockets is None else columns.sockets.names
+    images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in columns.readings)
+    sessions = {columns.session, *(one.device for one in columns.readings)} - {None}
+    twice = repeated([*numeric.names, *sockets, *images, *sessions])
     if twice:
-        what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(sorted(twice))} twice"
+        what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(twice)} twice"
         raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
     found: list[tuple[int, dict[str, float | str]]] = []
     for part, rows, sensor in zip(whole.parts, whole.index, _sensors(whole, columns), strict=True):
