@@ -91,6 +91,14 @@ def test_outputs_are_checked_before_the_fit(
     assert f"{option} {tmp_path / place} {message}" in done.error
 
 
+def test_options_that_do_not_belong_together_leave_the_model(sound: bytes, command: Command, tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    model.write_bytes(sound)
+    done = command("report", model, "-o", tmp_path / "r.html", "--against", "temperature", "--json", model)
+    assert done.code in (1, 2)
+    assert model.read_bytes() == sound
+
+
 def test_a_model_that_cannot_be_written(small_site: Site, command: Command, tmp_path: Path) -> None:
     csv = edited(small_site, tmp_path / "t.csv", rows_of(*range(12)))
     done = command(*small_site.fit(csv, tmp_path / "none" / "model", "--holdout", 0))

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv.columns import Group
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
@@ -136,6 +137,16 @@ def test_a_round_trip_does_not_mix_frames(tmp_path: Path) -> None:
     write_measurements(tmp_path / "t.csv", data, SI, session="day")
     again = dc.read_measurements(tmp_path / "t.csv", NAMES, list("xyz"), length="m", angle="rad", session="day")
     assert again.device_names == data.device_names
+
+
+def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
+    data = KINDS["all"]()
+    with pytest.raises(MeasurementError, match=says("distinct names", "socket")):
+        write_measurements(tmp_path / "t.csv", data, SI, session="socket")
+
+
+def test_whole_numbers_are_units() -> None:
+    assert float(Group(("a",), 1000).to_si(torch.tensor([[5.0]], dtype=torch.float64))) == 0.005
 
 
 LINES = """a,b,x,y,z,d,u,v,spot,who,sd

@@ -103,6 +103,16 @@ def test_a_pipe_is_read_twice(tmp_path: Path) -> None:
     assert_close(q, read_joints(path, JOINTS, SI), rtol=0, atol=0)
 
 
+def test_a_pipe_that_is_no_text(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    feeder = threading.Thread(target=lambda: pipe.write_bytes(b"PK\x03\x04\xff\xfe"))
+    feeder.start()
+    with pytest.raises(MeasurementError, match=says("not UTF-8", "CSV")), open_joints(pipe, JOINTS, SI):
+        pass
+    feeder.join()
+
+
 def test_a_file_that_changes_between_the_passes(tmp_path: Path) -> None:
     path = written(tmp_path, lines())
     with open_joints(path, JOINTS, SI) as file:
