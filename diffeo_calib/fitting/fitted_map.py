@@ -23,6 +23,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional, of_parameters
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
@@ -231,6 +232,8 @@ class FittedMap:
         """
         known, K = self.conditional, len(self.geodesic.spec.prior_variance)
         known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        if isinstance(known, ConjugateGradientRegression):
+            known.features(at)  # which it has not
         slopes = of_parameters(at, K + len(columns)).clone()
         slopes[..., K:][..., columns] = effects
         return known.posterior(replace(at, sensitivity=slopes))
@@ -331,6 +334,17 @@ class FittedMap:
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
         return self.conditional.posterior(self.parameters_as_points(which))[0]
+
+    def shift_covariance(self) -> Tensor:
+        """(c, c) posterior covariance of the shifts that rows of the fit share, in units of their deviations."""
+        Z, first = self.noise.shared, len(self.geodesic.spec.prior_variance)
+        known = self.conditional
+        known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        if not isinstance(known, ConjugateGradientRegression):
+            return self.parameter_covariance(first + torch.arange(Z.shape[2], device=Z.device))
+        alone = ConjugateGradientRegression(known.linearisation, self.noise.own)  # 1 - Z^T K^-1 Z would lose all digits
+        eye = torch.eye(Z.shape[2], dtype=Z.dtype, device=Z.device)
+        return torch.linalg.inv(eye + torch.einsum("nmc,nmk->ck", Z, alone.solve(Z)))
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""

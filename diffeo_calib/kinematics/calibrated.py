@@ -211,11 +211,13 @@ class CalibratedKinematics:
             return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
         ball = self.ball and bool(rows.points[:, -1].isnan().all())
-        asked = {"free": free, "marker_std": marker_std, "ball": ball, "learn": learn}
-        placed, found = register_again(model.map, model.nominal, self.lever, rows, **asked)
+        asked = model.map, model.nominal, self.lever, rows
+        placed, found = register_again(*asked, free=free, marker_std=marker_std, ball=ball, learn=learn)
+        learns, before = placed.registration is None, getattr(self.registration, "table_sha256", "")
+        found = replace(found, table_sha256=" ".join([before, measurements.sha256][: 1 + learns]).strip())
+        vars(placed).update({} if learns else {"registration": found})
         known = {"map": placed.to(self.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-        learnt = None if placed.registration else replace(found, table_sha256=measurements.sha256)
-        seen = self._with(**known, learnt=learnt)._carrying(self.nominal.load)
+        seen = self._with(**known, learnt=found if learns else None)._carrying(self.nominal.load)
         seen = seen._with(placement=registered_devices(self, seen))
         return seen._with(placement=devices_beside(seen, measurements))
 
@@ -462,9 +464,9 @@ class CalibratedKinematics:
         return self._tool(tool, frame, tip).predict(self._joints(q).detach())
 
     def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
-        own, tip = self.tool if tool is None else tool_transform(tool), tip or self.tool_tip
+        own = self.tool if tool is None else tool_transform(tool)
         fitted = self.map.unregistered if frame == "base" else self.map  # where the device stands does not matter there
-        return ToolKinematics(fitted, self.nominal, own, frame, tip)
+        return ToolKinematics(fitted, self.nominal, own, frame, tip or self.tool_tip)
 
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
@@ -479,8 +481,7 @@ class CalibratedKinematics:
             NumericalError: a target cannot be reached from its start.
         """
         q = self._joints(start)
-        targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)
-        return self.map.inverse(targets.flatten(1), q)
+        return self.map.inverse(as_tensor(points, "points", (len(q), self.markers, 3), empty=True).flatten(1), q)
 
     def _program_for(self, q: Tensor) -> Program | None:
         """The program that answers a query at q; None where torch must."""
@@ -488,8 +489,7 @@ class CalibratedKinematics:
 
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        known = {name: value for name, value in vars(self).items() if name != "bodies"}
-        return CalibratedKinematics(**known | changes)
+        return CalibratedKinematics(**{name: own for name, own in vars(self).items() if name != "bodies"} | changes)
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

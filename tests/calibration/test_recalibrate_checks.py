@@ -43,6 +43,11 @@ def test_rows_that_a_registration_learnt_from_would_count_twice(
     with pytest.raises(InputError, match="fitted to 20 of these 20 measurements: they would count twice; pass rows"):
         dc.recalibrate(dc.load(tmp_path / "model"), new)  # pyright: ignore[reportArgumentType]
     dc.recalibrate(arm.model.registered(new, learn=False), new)
+    other = measured(simulated(1)[0], 15, 6)
+    for learn in (True, False):
+        again = arm.model.registered(new).registered(other, learn=learn)
+        with pytest.raises(InputError, match="they would count twice"):
+            dc.recalibrate(again, new)
 
 
 def test_other_units_are_refused_before_the_work(arm: Case, new: dc.Measurements) -> None:

@@ -1,6 +1,7 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
 import json
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import torch
 from command_bank import Command
 from product_bank import usual_scales, with_usual_scales
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -76,6 +79,18 @@ def test_the_frames_are_found(result: dc.CalibrationResult) -> None:
     torch.testing.assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
     torch.testing.assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
     assert len(sessions.sentences()) == len(NAMES) - 1
+
+
+def test_the_frames_are_known_as_well_where_the_rows_are_many(result: dc.CalibrationResult) -> None:
+    """Where conjugate gradients take the place of a factor of all rows."""
+    fitted = result.model.map
+    expected, many = fitted.shift_covariance(), copy(fitted)
+    at = fitted.geodesic.linearise(None)
+    vars(many)["conditional"] = ConjugateGradientRegression(at, fitted.noise)
+    assert len(expected) > 6
+    assert_close(many.shift_covariance(), expected, rtol=1e-3, atol=1e-3 * float(expected.diagonal().min()))
+    with pytest.raises(InputError, match="too many"):
+        many.with_shifts(at, fitted.noise.shared, torch.ones(len(expected), dtype=torch.bool))
 
 
 def test_new_rows_of_a_session_are_brought_into_the_model_frame(

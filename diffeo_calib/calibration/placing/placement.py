@@ -217,12 +217,12 @@ class Placement(tuple[DeviceSet, ...]):
         Args:
             fitted: the fit. around: its map, with the covariances of the model. at, known: see :class:`Settled`.
         """
-        sets, parameters = list[DeviceSet](), len(around.geodesic.spec.prior_variance)
-        shifts, sizes = fitted.shifts, [own.size for own in self]
+        sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.size for own in self]
+        whole = around.shift_covariance() if len(shifts) else shifts[:, None]
         numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
         for own, part in zip(self, numbers.split(sizes), strict=True):
             if isinstance(own, kind):
-                covariance = around.parameter_covariance(parameters + part)
+                covariance = whole[part[:, None], part]
                 sets.append(own.settled(Settled(shifts[part], covariance, around, *at, **known)))
         return Placement(sets)
 

@@ -245,7 +245,8 @@ def check_arguments(model: object, new: object, marker: object) -> None:
 
 def check_other_table(model: CalibratedKinematics, new: Any) -> None:
     """Raise InputError for rows of the model's own fit, or that it learnt from: they would count twice."""
-    if new.sha256 in [each.table_sha256 for each in (model.provenance, model.learnt) if each is not None]:
+    known = [each.table_sha256 for each in (model.provenance, model.registration) if each is not None]
+    if new.sha256 in " ".join(known).split():
         used = int(rows_used_in_fit(model, new.q).sum())
         if used:
             what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"

@@ -80,7 +80,7 @@ class Registration:
         excess: residuals in units of what model and noise lead to expect, outliers left out; about 1.
         same_place: probability that the markers stayed where they were; None if that was not asked.
         undetermined: sentences about directions that the rows hardly determine.
-        table_sha256: of the table, where the model learnt from its rows, see :attr:`Measurements.sha256`; else empty.
+        table_sha256: of the tables from which the model learnt, see :attr:`Measurements.sha256`, with spaces between.
     """
 
     transform: Tensor
