@@ -184,6 +184,7 @@ def found_outliers(
     if not bool(bad.any()):
         return []
     labels = data.bodies.labels(data, model.on)
+    data = data if labels[0][1] is None else data.with_tips([str(tip) for _, tip in labels])
     predicted = model.at_payloads(data.payload)(data.q).detach()
     found = [
         Outlier(

@@ -122,7 +122,7 @@ def test_masses_that_cannot_be(folder: Path, command: Command, tmp_path: Path) -
     arguments = folder / "m.safetensors", tmp_path / "t.csv", *POSITION, "--payload", "kg"
     done = command("evaluate", *arguments)
     assert done.code == 1
-    assert "line 3, column 'kg': expected a mass of 0 or more, got -5" in done.err
+    assert "line 3, column 'kg': expected a mass of 0 or more, got '-5'" in done.err
     refused = command("recalibrate", folder / "m.safetensors", folder / "t.csv", *POSITION, "-o", tmp_path / "n.st")
     assert refused.code == 1
     assert "with payloads" in refused.err
