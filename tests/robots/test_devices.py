@@ -59,7 +59,7 @@ CALLS: dict[str, Callable[[], Tensor | tuple[Tensor, ...]]] = {
     "chain": lambda: mixed()(Q),
     "chain of lists": lambda: mixed()(Q.tolist()),  # pyright: ignore[reportArgumentType]
     "chain's jacobian": lambda: mixed().jacobian(Q),
-    "chain's frames": lambda: mixed().frames(Q),
+    "chain's frames": lambda: mixed().joint_frames(Q),
     "chain's constants": lambda: constants(mixed()),
     "urdf and dh": urdf_and_table,
     "poses": lambda: geometry().poses(Q),
