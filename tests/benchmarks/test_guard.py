@@ -48,6 +48,7 @@ CASE = ("calibrate", "positions")
         ("true", 1.06, "calibrate, positions: true"),
         ("new", 0.8, "calibrate, positions: new"),
         ("inside", 0.8, "calibrate, positions: inside"),
+        ("said", 2.0, "calibrate, positions: expected and true error"),
         ("true", None, "calibrate, positions: no true any more"),
     ],
 )

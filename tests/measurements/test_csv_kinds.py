@@ -16,6 +16,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.columns import Group
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
+from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
@@ -143,6 +144,16 @@ def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
     data = KINDS["all"]()
     with pytest.raises(MeasurementError, match=says("distinct names", "socket")):
         write_measurements(tmp_path / "t.csv", data, SI, session="socket")
+
+
+@pytest.mark.parametrize(("column", "cells"), [("u", "s,0,0,,5"), ("board_y", "s,0,,5,5")])
+def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: Path) -> None:
+    """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
+    path = tmp_path / "t.csv"
+    path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,{cells}\n")
+    columns = TableColumns(NAMES, list("xyz"), readings=(ImageColumns((640, 480)),))
+    with pytest.raises(MeasurementError, match=says("line 3", f"column '{column}'", "an empty cell")):
+        read_observations(path, columns, SI)
 
 
 def test_whole_numbers_are_units() -> None:
