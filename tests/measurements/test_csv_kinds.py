@@ -146,7 +146,7 @@ def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
         write_measurements(tmp_path / "t.csv", data, SI, session="socket")
 
 
-@pytest.mark.parametrize(("column", "cells"), [("u", "s,0,0,,5"), ("board_y", "s,0,,5,5")])
+@pytest.mark.parametrize(("column", "cells"), [("u", "s,0,0,,"), ("board_x", "s,,,5,5"), ("board_y", "s,0,,5,5")])
 def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: Path) -> None:
     """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
     path = tmp_path / "t.csv"
