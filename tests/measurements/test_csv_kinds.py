@@ -150,9 +150,9 @@ def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
 def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: Path) -> None:
     """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
     path = tmp_path / "t.csv"
-    path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,{cells}\n")
+    path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,s,1,1,5,5\n1,2,,,,{cells}\n")
     columns = TableColumns(NAMES, list("xyz"), readings=(ImageColumns((640, 480)),))
-    with pytest.raises(MeasurementError, match=says("line 3", f"column '{column}'", "an empty cell")):
+    with pytest.raises(MeasurementError, match=says("line 4", f"column '{column}'", "an empty cell")):
         read_observations(path, columns, SI)
 
 
