@@ -31,6 +31,8 @@ TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 (tens of periods per turn) and eccentricity (one)."""
 OBJECTIVE_OF_FAILURE = 1e12
 """Objective where G + R cannot be factorised: the line search then shortens its step."""
+LARGEST_GAIN = 1e5
+"""Variance by an unknown, relative to that of the fields and the noise, up to which it costs no digits among them."""
 
 
 @dataclass(frozen=True)
@@ -162,19 +164,23 @@ def log_posterior(
         scales = centre.from_logarithms(point)
         noise = numbers.blocks_of_table(told.weighted_noise(scales))
         variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
-    root = variance.detach().sqrt()
     F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
+    gain = variance.detach() * numbers.S.square().amax(0)
+    wide = gain > LARGEST_GAIN * F.diagonal().min()
+    narrow, S = numbers.S[:, ~wide], numbers.S[:, wide]
+    F, root = F.addmm_(narrow * variance.detach()[~wide], narrow.T), variance.detach()[wide].sqrt()
     try:
-        factor = Factor.of(F, numbers.S * root)
+        factor = Factor.of(F, S * root)
     except NumericalError:
         return None
     mu = factor.solve(numbers.target[:, None])[:, 0]
     slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
     with torch.enable_grad():
         by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
-        by_unknowns = factor.by_variance(root * (numbers.S.T @ mu)) @ variance.log()
+        by_wide = factor.by_variance(root * (S.T @ mu)) @ variance[wide].log()
+        by_narrow = ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-        (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
+        (data.pairs.inner(values, slope) + by_noise + by_wide + by_narrow + density).backward()
     likelihood = factor.log_density(numbers.target, mu)
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(likelihood, float(density.detach()), gradient)
