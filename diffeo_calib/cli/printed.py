@@ -20,9 +20,8 @@ from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.errors import SIZES, Evaluation
 
-SIZES = ("RMS", "median", "95 %", "max")
 WIDEST = 1000
 """Characters of the widest table."""
 MOST_OUTLIERS = 10
@@ -44,11 +43,8 @@ class ErrorTable:
 
     def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
         """Add a row: its errors, what it is called, and the expected RMS."""
-        per_unit = errors.shown[1]
-        values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
-        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
-        turned = [angle for angle in angles if angle is not None]
-        self.rows.append((labels, values, turned, [] if expected is None else [per_unit * expected]))
+        last = [] if expected is None else [errors.shown[1] * expected]
+        self.rows.append((labels, errors.sizes, errors.angle_sizes, last))
 
     def _table(self, title: str, groups: Sequence[int]) -> Table:
         """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""

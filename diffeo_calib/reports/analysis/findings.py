@@ -206,7 +206,10 @@ def find(
     else:
         shown = Shown({}, rows.q, rows.q[:, 0])
     progress("analysis", 2, STEPS)
-    repeats, curve = _repeats(rows, model, measured, kinematics), rows.learning_curve() if rows.known else []
+    noise, curve = float(model.map.new_noise.diagonal().mean().sqrt()), rows.learning_curve() if rows.known else []
+    repeats = None if measured is None else repeats_of(measured, kinematics, noise)
+    if repeats is None and model.registration is None and rows.known:
+        repeats = repeats_of(rows.measurements, kinematics, noise)
     columns = _columns(None if shown.predictions is None else shown.predictions.data, against)
     progress("analysis", 3, STEPS)
     deviations = Deviations.of(model).planned(model)
@@ -252,9 +255,9 @@ def _of_table(
     """Rows that the model has not seen; if there are none, all as fitted. ``measured``: their positions."""
     mask, own = unseen(model, data.q), list(places.values())[-1]
     new = bool(mask.any())
+    LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
     errors = {name: residuals(kinematics, places[name], data).rows(mask) for name, kinematics in stages.items()}
-    LOG.info("judged by %d rows, %d others were used before", int(mask.sum()), int((~mask).sum()))
     shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
     seen = None if measured is None or not new else unseen(model, measured.q)
     if measured is None or seen is None or not bool(seen.any()):
@@ -282,17 +285,6 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
         steps = steps_of(model, found.data) if len(outliers) >= gates.LAG_ROWS else []
         moved = [step.sentence() for step in steps[:1]] or [block_text(model, found.data, outliers) or ""]
     return Shown(errors, found.data.q, found.data.lines, False, found, outliers, list(filter(None, moved)))
-
-
-def _repeats(
-    rows: FitRows, model: CalibratedKinematics, data: Measurements | None, stages: Mapping[str, Kinematics]
-) -> Repeats | None:
-    """Repeatability from repeated configurations, in the table or else in the rows of the fit."""
-    noise = float(model.map.new_noise.diagonal().mean().sqrt())
-    repeats = None if data is None else repeats_of(data, stages, noise)
-    if repeats is None and model.registration is None and rows.known:
-        repeats = repeats_of(rows.measurements, stages, noise)
-    return repeats
 
 
 def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Tensor]:

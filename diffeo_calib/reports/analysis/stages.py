@@ -69,8 +69,10 @@ class Deviations:
     @classmethod
     def of(cls, model: CalibratedKinematics, seed: int = 0) -> Deviations:
         """The deviations of a model at random configurations."""
-        q, fitted = configurations(model, CONFIGURATIONS, seed), model.configurations.to(HOST)
-        fitted = fitted[:: -(-len(fitted) // MEASURED)]
+        fitted = model.configurations.to(HOST)
+        low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
+        draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+        q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
         return cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
 
     def planned(self, model: CalibratedKinematics, seed: int = 0) -> Deviations:
@@ -98,11 +100,3 @@ def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     q = q.to(model.configurations.device)
     covariance = model.bodies.predicted(model, q, noise=False).places
     return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
-
-
-def configurations(model: CalibratedKinematics, count: int, seed: int) -> Tensor:
-    """(count, n) random configurations in the joint ranges of a model's fit, within the robot's limits."""
-    fitted = model.configurations.to(HOST)
-    low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
-    draws = torch.rand(count, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
-    return low + draws * (high - low)

@@ -46,7 +46,7 @@ from diffeo_calib.reports.plots.joints import (
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.payload import payload_sentence
-from diffeo_calib.sensors.errors import ERRORS, Evaluation
+from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
@@ -80,14 +80,12 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     """Errors of one kind of rows by stage, and orientation errors in degrees if there are any."""
     some = next(iter(stages.values()))
-    unit, per_unit = some.shown
-    header = ["stage", f"RMS [{unit}]", "median", "95 %", "max"]
-    header += ["RMS [deg]", "median", "95 %", "max"] * (some.angles is not None)
-    rows = []
-    for name, own in stages.items():
-        cells = [f"{per_unit * value:.3f}" for value in (own.rms, own.median, own.p95, own.max)]
-        angles = (own.angle_rms, own.angle_median, own.angle_p95, own.angle_max)
-        rows.append([name, *cells, *(f"{angle:.4f}" for angle in angles if angle is not None)])
+    units = [some.shown[0], *["deg"] * (some.angles is not None)]
+    header = ["stage", *(name for unit in units for name in (f"{SIZES[0]} [{unit}]", *SIZES[1:]))]
+    rows = [
+        [name, *(f"{size:.3f}" for size in own.sizes), *(f"{size:.4f}" for size in own.angle_sizes)]
+        for name, own in stages.items()
+    ]
     return Table(f"{some.title} by stage", header, rows)
 
 
@@ -245,19 +243,16 @@ def trust(found: Findings) -> Section:
             "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
             "by the model's own deviations."
         )
-    pictures = [*_certainty(found), *_residuals(found)]
-    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
-
-
-def _certainty(found: Findings) -> Iterator[Picture]:
-    """Errors that the model expects, and those with fewer rows."""
-    if found.shown.predictions is not None:
+    pictures = list[Picture]()
+    if shown.predictions is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        yield panel("coverage", label, draw_coverage, found.shown.predictions)
+        pictures.append(panel("coverage", label, draw_coverage, shown.predictions))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
-        limit = found.limit if found.repeats else None
-        yield panel("learning", label, draw_learning_curve, found.learning_curve, found.forecast, limit)
+        what = found.learning_curve, found.forecast, found.limit if found.repeats else None
+        pictures.append(panel("learning", label, draw_learning_curve, *what))
+    pictures += _residuals(found)
+    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
 
 
 def _residuals(found: Findings) -> Iterator[Picture]:
