@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.findings import Outlier, Part
-from diffeo_calib.cli.console import plain
+from diffeo_calib.cli.console import plain, text_table
 from diffeo_calib.cli.record import record
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
@@ -48,16 +48,13 @@ class ErrorTable:
 
     def _table(self, title: str, groups: Sequence[int]) -> Table:
         """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""
-        table = Table(title=f"{title} {self.of}", title_justify="left")
-        for column in self.columns:
-            table.add_column(column)
         names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
-        for name in (name for group in groups for name in names[group]):
-            table.add_column(name, justify="right", no_wrap=True)
-        for row in self.rows:
-            values = [float(value) for group in groups for value in row[group]]
-            table.add_row(*row[0], *("-" if isnan(value) else f"{value:.4f}" for value in values))
-        return table
+        header = [*self.columns, *(name for group in groups for name in names[group])]
+        rows = [
+            [*row[0], *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in row[group])]
+            for row in self.rows
+        ]
+        return text_table(f"{title} {self.of}", header, rows, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         last = [3] * self.expected
@@ -74,14 +71,12 @@ class ErrorTable:
 
 def parts_table(parts: Sequence[Part]) -> Table:
     """How much each part of a model explains."""
-    table = Table(title="What explains how much (RMS over the training rows; parts may cancel)", title_justify="left")
-    table.add_column("part")
-    table.add_column("displacement, mm", justify="right")
-    table.add_column("angle, mrad (prismatic: mm)", justify="right")
-    for part in parts:
-        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
-        table.add_row(plain(part.name), f"{1e3 * part.displacement:.4f}", angle)
-    return table
+    angles = ["" if part.angle is None else f"{1e3 * part.angle:.4f}" for part in parts]
+    rows = [
+        [plain(part.name), f"{1e3 * part.displacement:.4f}", angle] for part, angle in zip(parts, angles, strict=True)
+    ]
+    title = "What explains how much (RMS over the training rows; parts may cancel)"
+    return text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], rows)
 
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
-from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
@@ -171,15 +170,13 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
     """
     more = "" if found.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"
-    table = Table(title=title, title_justify="left", min_width=len(title))
-    for column in (f"{more} poses".strip(), "model", *["held out"] * of_positions):
-        table.add_column(column, justify="right")
-    fewest = 0 if free is None else int((found.expected_rms > OPEN_M).sum())
+    fewest, rows = 0 if free is None else int((found.expected_rms > OPEN_M).sum()), list[list[str]]()
     for count in (*[0] * (not found.assumed and not fewest), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
-        table.add_row(str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions)
-    out.print(table)
+        rows.append([str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions])
+    header = [f"{more} poses".strip(), "model", *["held out"] * of_positions]
+    out.print(text_table(title, header, rows, labels=0, min_width=len(title)))
     if of_positions:
         say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
     if fewest:

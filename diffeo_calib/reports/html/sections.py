@@ -334,7 +334,8 @@ def repeatability(found: Findings) -> Section:
 
 def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
     """Everything needed to make the model again."""
-    lines = [*_origin(model.provenance, data_sha256), *_fit(model), *_places(model)]
+    lines = [*_origin(model.provenance, data_sha256), *_fit(model), "robot base in the measuring frame, 4 x 4 [m]:"]
+    lines += [*matrix_lines(model.geometry.base), *model.bodies.place_lines(model)]
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)
 
 
@@ -366,10 +367,3 @@ def _fit(model: CalibratedKinematics) -> Iterator[str]:
         certified = isfinite(summary.coupling_residual) and isfinite(summary.end_residual)
         yield f"optimum       {residuals if certified else 'without certificate: fewer control points than rows'}"
         yield f"status        {summary.status}; scales: {summary.scales}"
-
-
-def _places(model: CalibratedKinematics) -> Iterator[str]:
-    """Where the base and the markers, or the measured frame, were found."""
-    yield "robot base in the measuring frame, 4 x 4 [m]:"
-    yield from matrix_lines(model.geometry.base)
-    yield from model.bodies.place_lines(model)
