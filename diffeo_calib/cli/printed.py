@@ -51,8 +51,8 @@ class ErrorTable:
         names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
         header = [*self.columns, *(name for group in groups for name in names[group])]
         rows = [
-            [*row[0], *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in row[group])]
-            for row in self.rows
+            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group - 1])]
+            for labels, *numbers in self.rows
         ]
         return text_table(f"{title} {self.of}", header, rows, len(self.columns))
 

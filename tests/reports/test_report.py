@@ -299,6 +299,14 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     found = find(kind.model, wrong)
     assert found.deviations.error.whole < 1e-3 < found.judged.value
     assert verdict(found, 1e-3).startswith("Above")
+    new = find(kind.model, kind.new)
+    assert new.errors is not None
+    assert new.shown.predictions is not None
+    assert len(new.shown.predictions) == len(tracked) < new.count
+    assert list(new.kinds) == ["position", "socket"]
+    assert f"on {len(tracked)} rows that the model has not seen" in verdict(new)
+    assert "Spread within sockets: " in verdict(new)
+    assert new.errors["calibrated"].rms == pytest.approx(dc.evaluate(kind.model, kind.new).rms)
     assert verdict(find(kind.model), 1e-3).startswith("Within")
 
 

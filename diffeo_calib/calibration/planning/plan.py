@@ -320,9 +320,9 @@ def drawn(
     Raises:
         InputError: as there.
     """
-    robot, base, wheres = given, torch.eye(4, dtype=torch.float64, device=HOST), list[Where | None]()
+    base, wheres = torch.eye(4, dtype=torch.float64, device=HOST), list[Where | None]()
     if isinstance(given, CalibratedKinematics):
-        robot, base, wheres = given.robot, given.geometry.base, [one.where(given) for one in sensors]
+        base, wheres = given.geometry.base, [one.where(given) for one in sensors]
     held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
     seen, found = [where for where in wheres if where is not None], []
     each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
@@ -333,9 +333,9 @@ def drawn(
     for number, places, marker, where in each:
         if number:
             criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
-            found += [
+            found.append(
                 candidates(
-                    robot,
+                    given.robot if isinstance(given, CalibratedKinematics) else given,
                     -(-count * number // len(sensors)),
                     ranges=({} if where is None else where.ranges) | dict(ranges or {}),
                     keep=all_of(criteria),
@@ -344,7 +344,7 @@ def drawn(
                     ball=marker,
                     **cell,
                 )
-            ]
+            )
     return torch.cat(found)
 
 
@@ -418,7 +418,7 @@ def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, ob
 def _configurations(robot: Tree, values: object, name: str) -> Tensor:
     """(N, n) checked joint values, at least one row."""
     try:
-        q = robot.joint_values(values)
+        q = robot.joint_values(values)  # pyright: ignore[reportArgumentType]
     except InputError as error:
         raise InputError(f"`{name}`: {error}") from None
     if not len(q):

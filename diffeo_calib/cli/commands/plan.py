@@ -16,7 +16,7 @@ from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_fo
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, provenance_lines
+from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
@@ -64,17 +64,8 @@ def run(given: PlanOptions) -> None:
         model = None if given.model is None else load_kinematics(given.model)
         stated = stated_units(given.units) if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
-        if model is None:
-            source, markers = _robot(given, table)
-            robot = source
-        else:
-            say(*provenance_lines(model))
-            if given.payload_mass is not None:
-                model = model.with_payload(given.payload_mass)
-            elif model.payload is not None:
-                mass = f"a payload of {model.payload:g}, the median of the fit"
-                say(f"planned with {mass}; --payload-mass for another one")
-            source, markers, robot = model, model.geometry.tool, model.robot
+        source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
+        robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(stated.joints, robot)
 
         def configurations(table_of: Path | None) -> Tensor | None:
