@@ -110,11 +110,19 @@ def placement_lines(
     base = geometry.base
     place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
     yield f"robot base in {frame}: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
-    markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
-    for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
-        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1 + ball)
-        what = "ball" if ball and k == len(markers) - 1 > 0 else what
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
+    yield from _marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
+
+
+def _marker_lines(
+    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
+) -> Iterator[str]:
+    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
+    places, tips = (middles(points[None])[0], tips[::POINTS]) if poses else (points, tips)
+    for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
+        what = "ball" if ball and k == len(places) - 1 > 0 else what
+        end = "" if known is None else f", known to {_triple(1e3 * known[k], '.2g')} mm"
+        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{end}"
 
 
 def _triple(values: Tensor, digits: str = ".3f") -> str:
@@ -142,7 +150,15 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
-        yield from _marker_lines(found, tips, sure=not doubt)
+        tips, rigid = (
+            tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers),
+            found.lever is not None,
+        )
+        yield from _marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
+        if found.shift is not None:
+            largest = 1e3 * float(found.shift.norm(dim=1).max())
+            sure = f" (unmoved with probability {found.same_place:.2f})" if found.same_place is not None else ""
+            yield f"  that is {largest:.3f} mm from where it was{sure * (not doubt)}"
     if doubt:
         yield f"  these places were found as if the robot had not changed{doubt}"
 
@@ -155,21 +171,6 @@ def frame_lines(found: Registration) -> Iterator[str]:
     deviations = found.frame_deviations
     shift, small = 1e3 * deviations[:3], torch.rad2deg(deviations[3:])
     yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(small, '.2g')} deg"
-
-
-def _marker_lines(found: Registration, tips: Sequence[str], *, sure: bool) -> Iterator[str]:
-    rigid = found.lever is not None
-    places, deviations = found.markers, found.marker_deviations
-    tips = tips if len(tips) == len(places) else [tips[0]] * len(places)
-    places, tips = (middles(places[None])[0], tips[::POINTS]) if rigid else (places, tips)
-    for k, (place, deviation, tip) in enumerate(zip(places, deviations, tips, strict=False)):
-        what = "measured frame" if rigid else "marker" + f" {k}" * (len(places) > 1)
-        known = "" if rigid else f", known to {_triple(1e3 * deviation, '.2g')} mm"
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"
-    if found.shift is not None:
-        largest = 1e3 * float(found.shift.norm(dim=1).max())
-        stayed = "" if found.same_place is None or not sure else f" (unmoved with probability {found.same_place:.2f})"
-        yield f"  that is {largest:.3f} mm from where it was{stayed}"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

@@ -280,7 +280,7 @@ def _largest(found: Findings, own: OwnErrors) -> Table:
     order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
     lines = [[f"error [{unit}]", *(f"{per_unit * float(errors[row]):.3f}" for row in order)]]
     what = f"Largest: {own.errors.label}" if len(found.own) > 1 else "Largest errors"
-    if seen is not None and own.errors.what == ERRORS:
+    if seen is not None and own.errors.what == ERRORS and len(seen) == len(own.lines):
         what += ", and what the model expects of a measurement there"
         lines.append(["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)])
     lines += joint_values_by_row(found.model.robot, own.q[order])
