@@ -300,7 +300,6 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     assert found.deviations.error.whole < 1e-3 < found.judged.value
     assert verdict(found, 1e-3).startswith("Above")
     new = find(kind.model, kind.new)
-    assert new.errors is not None
     assert new.shown.predictions is not None
     assert len(new.shown.predictions) == len(tracked) < new.count
     assert list(new.kinds) == ["position", "socket"]

@@ -39,7 +39,7 @@ def run(wanted: ReportOptions) -> None:
     if found.shown.predictions is not None:
         record.add(coverage_95=found.shown.predictions.coverage())
     if data is not None and not found.shown.new:
-        each = "as fitted" if found.errors is None else "each predicted by all others"
+        each = "as fitted" if not found.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
     say(told, *expectation_lines(kinematics, None, found.deviations.error))
     say(f"report: {wanted.output}")

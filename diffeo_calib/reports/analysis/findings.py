@@ -119,11 +119,10 @@ class Findings:
         return [OwnErrors(one, self.shown.q[rows], self.shown.lines[rows]) for one, rows in each]
 
     @property
-    def errors(self) -> Mapping[str, Evaluation] | None:
-        """Errors of measured positions by stage, of a model that has not seen them; None without any."""
-        if self.shown.predictions is None:
-            return None
-        return next(stages for stages in self.kinds.values() if next(iter(stages.values())).what == ERRORS)
+    def errors(self) -> Mapping[str, Evaluation]:
+        """Errors of measured positions by stage, of a model that has not seen them; empty without any."""
+        kinds = [] if self.shown.predictions is None else self.kinds.values()
+        return next((stages for stages in kinds if next(iter(stages.values())).what == ERRORS), {})
 
     @property
     def count(self) -> int:

@@ -39,18 +39,18 @@ def rows_of(found: Findings, count: int | None = None) -> str:
         return "none, because no rows were passed"
     if found.shown.new:
         return f"{count} rows that the model has not seen"
-    if found.errors is None:
+    if not found.errors:
         return f"{count} rows of its own fit"
     return f"{count} rows of the fit, each predicted by {'all' if found.rows.whole else 'hundreds of'} others"
 
 
 def verdict(found: Findings, tolerance: float | None = None) -> str:
     """The result in one line: whether a tolerance, m, is kept, errors by stage, and those of every other kind."""
-    stages = found.expected if found.errors is None else {name: one.rms for name, one in found.errors.items()}
+    stages = {name: one.rms for name, one in found.errors.items()} or found.expected
     *before, (_, own) = stages.items()
     listed = "".join(f"{1e3 * value:.2f} mm {printable(name)}, " for name, value in before)
     text = f"{listed}{1e3 * own:.3f} mm calibrated"
-    if found.errors is None:
+    if not found.errors:
         text = f"{text}: RMS errors of positions that the model expects over the joint ranges of its rows."
     else:
         *_, errors = found.errors.values()
@@ -70,14 +70,14 @@ def verdict(found: Findings, tolerance: float | None = None) -> str:
 def _others(found: Findings) -> Iterator[tuple[str, str]]:
     """Errors of the model in rows of other kinds than measured positions: what they are, and their RMS."""
     for own, _, _ in found.own:
-        if found.errors is None or own.what != ERRORS:
+        if not found.errors or own.what != ERRORS:
             unit, per_unit = own.shown
             yield own.title, f"{per_unit * own.rms:.3f} {unit}"
 
 
 def figures(found: Findings) -> Iterator[tuple[str, str]]:
     """Name and value of the numbers at the top."""
-    if found.errors is None:
+    if not found.errors:
         for name, value in found.expected.items():
             yield f"expected error, {name}", f"{1e3 * value:.3f} mm"
     else:
@@ -121,7 +121,7 @@ def advice(found: Findings) -> Iterator[str]:
         if own.rms >= rival.rms:
             of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
             yield f"{of} model is no better than the {before} one on these rows: measure more poses."
-    if found.kinds and not shown.new and found.errors is None:
+    if found.kinds and not shown.new and not found.errors:
         yield "These are rows of the fit: pass rows that the model has not seen (--data)."
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
