@@ -293,9 +293,8 @@ def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Ten
         known = data.origin.numeric_columns(data.line_numbers, gaps=True)
     missing = [name for name in against if name not in known]
     if missing:
-        expected = (
-            f"columns of numbers: {', '.join(known)}" if known else "positions in a table that was read from a file"
-        )
+        alone = "a table of positions or poses alone, read from a file"
+        expected = f"columns of numbers: {', '.join(known)}" if known else alone
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
     words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]
