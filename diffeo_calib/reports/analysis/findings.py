@@ -199,7 +199,8 @@ def find(
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
     if data is not None and (bool(unseen(model, data.q).any()) or not rows.of_positions):
-        shown = _of_table(model, data, measured, kinematics, places or _placed(data, kinematics, own))
+        aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
+        shown = _of_table(model, data, measured, own, _errors(data, aligned, kinematics, own, places))
     elif rows.of_positions:
         shown = _left_out(model, rows, kinematics)
     else:
@@ -236,27 +237,45 @@ def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
     return new.to(HOST)
 
 
-def _placed(data: Any, stages: Mapping[str, Kinematics], own: Places) -> dict[str, Places]:
-    """Places of the devices beside each stage; frames and ball are those of the model where a stage knows none."""
+def _errors(
+    data: Any,
+    aligned: Measurements | None,
+    stages: Mapping[str, Kinematics],
+    own: Places,
+    places: Mapping[str, Places] | None,
+) -> dict[str, Evaluations]:
+    """Errors of all rows by stage.
+
+    Args:
+        data: the rows. aligned: the same in the frame of the model, without its drift, if all are measured positions.
+        own: places of the devices beside the model. places: beside every stage, if they are known.
+    """
     *before, last = stages
-    found = {name: place(stages[name], data) for name in before}
-    found = {name: replace(one, frames=one.frames or own.frames, ball=own.ball) for name, one in found.items()}
-    return found | {last: own}
+    found = dict[str, Evaluations]()
+    for name in before:
+        kinematics = stages[name]
+        if aligned is not None:
+            found[name] = residuals(kinematics, place(kinematics, aligned), aligned)
+        else:
+            at = place(kinematics, data) if places is None else places[name]
+            at = replace(at, frames=at.frames or own.frames, ball=own.ball)
+            found[name] = residuals(kinematics, at, data)
+    return found | {last: residuals(stages[last], own, data)}
 
 
 def _of_table(
-    model: CalibratedKinematics,
-    data: Any,
-    measured: Measurements | None,
-    stages: Mapping[str, Kinematics],
-    places: Mapping[str, Places],
+    model: CalibratedKinematics, data: Any, measured: Measurements | None, own: Places, every: Mapping[str, Evaluations]
 ) -> Shown:
-    """Rows that the model has not seen; if there are none, all as fitted. ``measured``: their positions."""
-    mask, own = unseen(model, data.q), list(places.values())[-1]
+    """Rows that the model has not seen; if there are none, all as fitted.
+
+    Args:
+        measured: their positions in the frame of the model. own: places of the devices. every: errors of all by stage.
+    """
+    mask = unseen(model, data.q)
     new = bool(mask.any())
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
-    errors = {name: residuals(kinematics, places[name], data).rows(mask) for name, kinematics in stages.items()}
+    errors = {name: found.rows(mask) for name, found in every.items()}
     shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
     seen = None if measured is None or not new else unseen(model, measured.q)
     if measured is None or seen is None or not bool(seen.any()):
