@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import log
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from diffeo_calib.kinematics.evaluation import (
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import sensor_of
-from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates
 
@@ -215,32 +215,40 @@ class Accuracy:
     of: str
 
 
-def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit: str) -> Accuracy:
+def accuracy(
+    model: CalibratedKinematics,
+    errors: Iterable[Evaluation],
+    unit: str,
+    expected: ExpectedError | None = None,
+    *,
+    which: str = "",
+) -> Accuracy:
     """The error by which a model is accepted, in a unit.
 
-    In m that of measured positions that took no part in the fit, of all if there are no others. Where no position was
-    measured it is the one that the model expects over the joint ranges of its rows. A spread within sockets and errors
-    of readings are no accuracy, but the model is not more accurate than these. In another unit that of its readings.
+    In m that of measured positions. Where no position was measured it is the one that the model expects over the joint
+    ranges of its rows. A spread within sockets and errors of readings are no accuracy, but the model is not more
+    accurate than these. In another unit that of its readings.
 
     Args:
-        found: errors of N rows. used: (N,) whether they were used in the fit. unit: m, px, ...
+        errors: of the rows that decide, kind by kind. unit: m, px, ... expected: by the model, if it is known already.
+        which: these rows are, in words.
 
     Raises:
         InputError: no row measured in this unit.
     """
-    new = found.rows(~used.cpu()) if not bool(used.all()) else found
-    beside = " not used in the fit" * bool((~used).any())
-    own = [one for one in new.values() if one.unit == unit and one.count]
+    judged = list(errors)
+    own = [one for one in judged if one.unit == unit and one.count]
+    labels = ["" if one.what == ERRORS else f"({one.label}) " for one in own]
     measured = [
-        Accuracy(one.rms, unit, f"{'' if one.what == 'errors' else f'({one.label}) '}on {one.count} rows{beside}")
-        for one in own
+        Accuracy(one.rms, unit, f"{label}on {one.count} rows{which}") for one, label in zip(own, labels, strict=True)
     ]
     if unit != "m" and measured:
         return measured[0]
     if unit != "m":
         fix = "give the limit in mm: without positions the error that the model expects is compared with it"
-        raise InputError.of(f"a limit in {unit}", expected="rows in this unit", got=", ".join(found), fix=fix)
-    if not any(one.what == "errors" for one in own):
-        of = "expected over the joint ranges of the fit, no position was measured"
-        measured.append(Accuracy(ExpectedError.of(model).whole, unit, of))
+        got = ", ".join(one.kind for one in judged)
+        raise InputError.of(f"a limit in {unit}", expected="rows in this unit", got=got, fix=fix)
+    if not any(one.what == ERRORS for one in own):
+        of = "expected over the joint ranges of the fit, without measured positions"
+        measured.append(Accuracy((expected or ExpectedError.of(model)).whole, unit, of))
     return max(measured, key=lambda one: one.value)

@@ -10,7 +10,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
+from rich.table import Table
 from rich.text import Text
 
 from diffeo_calib.cli.record import record
@@ -67,6 +68,16 @@ def show_error(error: object) -> None:
 def show_warning(message: Warning | str) -> None:
     """Print a warning as one sentence, with Python keywords as options."""
     err.print(f"[bold yellow]warning:[/] {_as_options(plain(message))}", highlight=False, soft_wrap=True)
+
+
+def text_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], labels: int = 1, **how: Any) -> Table:
+    """A table of text: the first columns, labels, to the left, numbers to the right. ``how``: as of rich's table."""
+    table = Table(title=title, title_justify="left", **how)
+    for number, name in enumerate(header):
+        table.add_column(name, justify="right" if number >= labels else "left", no_wrap=number >= labels)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 @contextmanager

@@ -13,16 +13,15 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.findings import Outlier, Part
-from diffeo_calib.cli.console import plain
+from diffeo_calib.cli.console import plain, text_table
 from diffeo_calib.cli.record import record
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.errors import SIZES, Evaluation
 
-SIZES = ("RMS", "median", "95 %", "max")
 WIDEST = 1000
 """Characters of the widest table."""
 MOST_OUTLIERS = 10
@@ -44,24 +43,18 @@ class ErrorTable:
 
     def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
         """Add a row: its errors, what it is called, and the expected RMS."""
-        per_unit = errors.shown[1]
-        values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
-        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
-        turned = [angle for angle in angles if angle is not None]
-        self.rows.append((labels, values, turned, [] if expected is None else [per_unit * expected]))
+        last = [] if expected is None else [errors.shown[1] * expected]
+        self.rows.append((labels, errors.sizes, errors.angle_sizes, last))
 
     def _table(self, title: str, groups: Sequence[int]) -> Table:
         """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""
-        table = Table(title=f"{title} {self.of}", title_justify="left")
-        for column in self.columns:
-            table.add_column(column)
         names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
-        for name in (name for group in groups for name in names[group]):
-            table.add_column(name, justify="right", no_wrap=True)
-        for row in self.rows:
-            values = [float(value) for group in groups for value in row[group]]
-            table.add_row(*row[0], *("-" if isnan(value) else f"{value:.4f}" for value in values))
-        return table
+        header = [*self.columns, *(name for group in groups for name in names[group])]
+        rows = [
+            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group - 1])]
+            for labels, *numbers in self.rows
+        ]
+        return text_table(f"{title} {self.of}", header, rows, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         last = [3] * self.expected
@@ -78,14 +71,12 @@ class ErrorTable:
 
 def parts_table(parts: Sequence[Part]) -> Table:
     """How much each part of a model explains."""
-    table = Table(title="What explains how much (RMS over the training rows; parts may cancel)", title_justify="left")
-    table.add_column("part")
-    table.add_column("displacement, mm", justify="right")
-    table.add_column("angle, mrad (prismatic: mm)", justify="right")
-    for part in parts:
-        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
-        table.add_row(plain(part.name), f"{1e3 * part.displacement:.4f}", angle)
-    return table
+    angles = ["" if part.angle is None else f"{1e3 * part.angle:.4f}" for part in parts]
+    rows = [
+        [plain(part.name), f"{1e3 * part.displacement:.4f}", angle] for part, angle in zip(parts, angles, strict=True)
+    ]
+    title = "What explains how much (RMS over the training rows; parts may cancel)"
+    return text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], rows)
 
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
@@ -119,11 +110,19 @@ def placement_lines(
     base = geometry.base
     place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
     yield f"robot base in {frame}: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
-    markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
-    for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
-        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1 + ball)
-        what = "ball" if ball and k == len(markers) - 1 > 0 else what
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
+    yield from _marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
+
+
+def _marker_lines(
+    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
+) -> Iterator[str]:
+    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
+    places, tips = (middles(points[None])[0], tips[::POINTS]) if poses else (points, tips)
+    for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
+        what = "ball" if ball and k == len(places) - 1 > 0 else what
+        end = "" if known is None else f", known to {_triple(1e3 * known[k], '.2g')} mm"
+        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{end}"
 
 
 def _triple(values: Tensor, digits: str = ".3f") -> str:
@@ -151,7 +150,15 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
-        yield from _marker_lines(found, tips, sure=not doubt)
+        tips, rigid = (
+            tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers),
+            found.lever is not None,
+        )
+        yield from _marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
+        if found.shift is not None:
+            largest = 1e3 * float(found.shift.norm(dim=1).max())
+            sure = f" (unmoved with probability {found.same_place:.2f})" if found.same_place is not None else ""
+            yield f"  that is {largest:.3f} mm from where it was{sure * (not doubt)}"
     if doubt:
         yield f"  these places were found as if the robot had not changed{doubt}"
 
@@ -164,21 +171,6 @@ def frame_lines(found: Registration) -> Iterator[str]:
     deviations = found.frame_deviations
     shift, small = 1e3 * deviations[:3], torch.rad2deg(deviations[3:])
     yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(small, '.2g')} deg"
-
-
-def _marker_lines(found: Registration, tips: Sequence[str], *, sure: bool) -> Iterator[str]:
-    rigid = found.lever is not None
-    places, deviations = found.markers, found.marker_deviations
-    tips = tips if len(tips) == len(places) else [tips[0]] * len(places)
-    places, tips = (middles(places[None])[0], tips[::POINTS]) if rigid else (places, tips)
-    for k, (place, deviation, tip) in enumerate(zip(places, deviations, tips, strict=False)):
-        what = "measured frame" if rigid else "marker" + f" {k}" * (len(places) > 1)
-        known = "" if rigid else f", known to {_triple(1e3 * deviation, '.2g')} mm"
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"
-    if found.shift is not None:
-        largest = 1e3 * float(found.shift.norm(dim=1).max())
-        stayed = "" if found.same_place is None or not sure else f" (unmoved with probability {found.same_place:.2f})"
-        yield f"  that is {largest:.3f} mm from where it was{stayed}"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

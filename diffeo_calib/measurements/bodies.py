@@ -166,10 +166,6 @@ class Bodies:
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
         return pose_jacobian(frames, self.lever, board)
 
-    def perhaps_moved(self, *, far: bool) -> bool:
-        """Whether a device or body may have moved, if the origins are ``far`` off or not: turns do not show there."""
-        return far or self.lever is not None
-
     def moved_words(self, points: int) -> str:
         """Name in messages for this number of points of the tool that may have moved."""
         return f"the {'marker' if self.lever is None else 'tool'}{'s' * (points > self.points)}"

@@ -448,12 +448,6 @@ class Measurements(ImageTable):
         return [f"hidden in some of {len(self)} rows: {few(counts)} of them"] * bool(counts)
 
     @property
-    def set_up_hint(self) -> str:
-        """Advice on rows of several set-ups that do not fit a model; empty where none is named."""
-        hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
-        return "" if self.session is None else hint
-
-    @property
     def present_sessions(self) -> tuple[str, ...]:
         """Names of the sessions that have rows here: a part of a table keeps the names of all."""
         return tuple(name for name in dict.fromkeys(self.device_names) if name)

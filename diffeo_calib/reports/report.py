@@ -5,20 +5,18 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import Any
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, printable, shown
+from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.reports.analysis.findings import PositionFindings, check_arguments, find
-from diffeo_calib.reports.analysis.kinds import Findings, find_kinds, of_positions_alone
+from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import kinds, sections, sentences
+from diffeo_calib.reports.html import sections, sentences
 from diffeo_calib.reports.html.document import Page
 from diffeo_calib.sensors.places import Places
 
@@ -46,7 +44,7 @@ def write_report(
         model: the calibrated model.
         path: the file.
         data: rows of any kinds; rows of the fit, and of a registration, are left out. By default, and if no others are
-            left, the rows of the fit are shown, each predicted by all others in closed form.
+            left, the rows of the fit are shown: measured positions each predicted by all others in closed form.
         title: of the page, by default the robot's.
         stages: name -> kinematics (N, n) -> (N, P, 3) in m to compare, the model last; by default the nominal robot and
             the geometric calibration, base and markers where they fit best.
@@ -65,46 +63,25 @@ def write_report(
             does not have, or a file that cannot be written.
     """
     check_writable(path)  # before the work
-    check_arguments(model, data)
     if tolerance is not None:
         check_number(tolerance, "`tolerance`", above=0.0)
-    if of_positions_alone(model, data):
-        found: Findings = find(model, data, stages=stages, against=against, progress=progress)
-    else:
-        if against:
-            got, fix = ", ".join(against), "leave them out: this page shows errors of each kind of rows in its own unit"
-            raise InputError.of("`against`", expected="a table of measured positions", got=got, fix=fix)
-        found = find_kinds(model, data, stages=stages, places=places, progress=progress)
-    robot, made, summary, words = model.robot, model.provenance, model.summary, words_of(found)
+    found = find(model, data, stages=stages, places=places, against=against, progress=progress)
+    robot, made, summary = model.robot, model.provenance, model.summary
     date = "" if made is None else f", fitted {made.date[:10]}"
     note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
-    fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", words.rows_of(found)
+    fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", sentences.rows_of(found)
     if warnings is None:
         warnings = (summary.warnings or "").splitlines() if summary else []
-    sha256 = None if data is None or not found.new else data.sha256
+    sha256 = None if data is None or not found.shown.new else data.sha256
     page = Page(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",
-        verdict=f"{judged(found, tolerance)}{words.verdict(found)}",
+        verdict=sentences.verdict(found, tolerance),
         warnings=warnings,
-        advice=list(words.advice(found)),
-        figures=dict(words.figures(found)),
-        sections=[*sections.sections(found, rows, progress), sections.record(model, sha256)],
+        advice=list(sentences.advice(found)),
+        figures=dict(sentences.figures(found)),
+        sections=[*sections.sections(found, progress), sections.record(model, sha256)],
     )
     write_whole(path, page.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
-
-
-def judged(found: Findings, tolerance: float | None) -> str:
-    """Whether a tolerance, m, is kept, as a sentence; nothing without one."""
-    if tolerance is None:
-        return ""
-    rms, of = found.judged
-    within = "Within" if rms <= tolerance else "Above"
-    return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * rms:.3f} mm RMS {of}. "
-
-
-def words_of(found: Findings) -> ModuleType:
-    """The sentences about some findings: their rows, verdict, advice and figures."""
-    return sentences if isinstance(found, PositionFindings) else kinds

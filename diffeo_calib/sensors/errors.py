@@ -16,6 +16,8 @@ from diffeo_calib.common.quantiles import known, quantile
 from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 
 NAMES = ("rms", "median", "p95", "max")
+SIZES = ("RMS", "median", "95 %", "max")
+"""The same in heads of tables."""
 BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")
 """Attributes of an evaluation with a value for each row."""
 ERRORS, SPREAD, READINGS = "errors", "spread", "readings"
@@ -166,6 +168,16 @@ class Evaluation:
         unit, per_unit = self.shown
         return f"{per_unit * self.rms:.4f} {unit}"
 
+    @property
+    def sizes(self) -> list[float]:
+        """Numbers under :data:`SIZES` in the unit in which they are shown."""
+        return [self.shown[1] * getattr(self, name) for name in NAMES]
+
+    @property
+    def angle_sizes(self) -> list[float]:
+        """The same of angles, degrees; empty without orientations."""
+        return [] if self.angles is None else [getattr(self, f"angle_{name}") for name in NAMES]
+
     def __repr__(self) -> str:
         text = f"{len(known(self.errors))} {WORDS[self.what]} in {self.unit}: "
         text += ", ".join(f"{n}={getattr(self, n):.4g}" for n in NAMES)
@@ -177,12 +189,10 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         """A table of the errors, for notebooks."""
-        unit, per_unit = self.shown
         name = "position" if self.what == ERRORS else self.title
-        rows = [[f"{name} [{unit}]", *(f"{per_unit * getattr(self, one):.4f}" for one in NAMES)]]
-        if self.angles is not None:
-            rows.append(["orientation [deg]", *(f"{getattr(self, f'angle_{one}'):.4f}" for one in NAMES)])
-        return table_html(f"Errors of {len(self.errors)} rows", ("", "RMS", "median", "95 %", "max"), rows)
+        each = {f"{name} [{self.shown[0]}]": self.sizes, "orientation [deg]": self.angle_sizes}
+        rows = [[what, *(f"{value:.4f}" for value in values)] for what, values in each.items() if values]
+        return table_html(f"Errors of {len(self.errors)} rows", ("", *SIZES), rows)
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """One entry for every row and body, as :meth:`Evaluations.to_frame` writes them: mm, px, deg."""

@@ -14,7 +14,9 @@ from kind_bank import kind_named, marked, rigid_rms
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning.candidates import Tracker
 from diffeo_calib.calibration.planning.knowledge import of_model
+from diffeo_calib.calibration.planning.plan import drawn
 from diffeo_calib.calibration.planning.sensors import DeviceReadings
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
@@ -284,3 +286,23 @@ def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
     two = [dc.Sensor.positions(), dc.Sensor.distances([[5.0, 0.0, 0.0]])]
     with pytest.raises(dc.DiffeoCalibError, match="`measured`: expected configurations that one device"):
         dc.plan(arm.model, q, 3, sensor=two, measured=q[:2])
+
+
+def test_sensors_share_the_configurations_that_are_drawn() -> None:
+    """Half of them bring the ball to its sockets; those of the tracker show it the marker; all keep their ranges."""
+    robot, markers = SimulatedArm(0).nominal, torch.tensor([[0.0, 0.1, 0.1], [0.05, 0.0, 0.1]], dtype=torch.float64)
+    places = torch.tensor([[0.6, 0.1, 0.4], [0.5, -0.3, 0.5]], dtype=torch.float64)
+    sensors, first = [dc.Sensor.positions(), dc.Sensor.sockets(places)], robot.joint_names[0]
+    how: dict[str, Any] = {"ranges": {first: (-1.0, 1.0)}, "keep": lambda q: q[:, 1] > -0.5, "seed": 3}
+    q = drawn(robot, sensors, 20, markers, **how)
+    assert len(q) == 20
+    assert bool((q[:, 0].abs() <= 1.0).all())
+    assert bool((q[:, 1] > -0.5).all())
+    tips = robot.tip_poses(q)[:, 0]
+    ball = tips[:, :3, :3] @ markers[-1] + tips[:, :3, 3]
+    near = torch.cdist(ball, places).amin(1) < 1e-3
+    assert near.tolist() == [False] * 10 + [True] * 10
+    tracker = Tracker((3.0, 0.0, 1.0))
+    tips = robot.tip_poses(drawn(robot, sensors[:1], 20, markers, tracker=tracker, **how))[:, 0]
+    line = torch.tensor(tracker.position, dtype=torch.float64) - (tips[:, :3, :3] @ markers.mean(0) + tips[:, :3, 3])
+    assert bool(((line * tips[:, :3, 2]).sum(1) >= 0.7 * line.norm(dim=1)).all())

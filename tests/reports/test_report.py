@@ -19,9 +19,8 @@ from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, Measureme
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.analysis.findings import PositionFindings as Findings
-from diffeo_calib.reports.analysis.kinds import find_kinds
-from diffeo_calib.reports.report import judged
+from diffeo_calib.reports.analysis.findings import Findings, find
+from diffeo_calib.reports.html.sentences import verdict
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.tables import divided
 
@@ -66,14 +65,14 @@ def test_models_of_every_kind(name: str, request: pytest.FixtureRequest, tmp_pat
     assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(case.model, new).rms)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{1e3 * found.errors['calibrated'].rms:.3f}\u00a0mm calibrated" in text
-    assert f"{SHOWN} poses that the model has not seen" in text
+    assert f"{SHOWN} rows that the model has not seen" in text
     assert len(text) < 3e6
 
 
 def test_without_measurements_the_rows_of_the_fit_are_left_out_one_by_one(arm: Case, tmp_path: Path) -> None:
     found = made(tmp_path / "report.html", arm.model)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "60 poses of the fit, each predicted by all others" in text
+    assert "60 rows of the fit, each predicted by all others" in text
     assert found.errors["calibrated"].rms > 1.5 * dc.evaluate(arm.model, arm.train).rms
     assert arm.model.provenance is not None
     assert arm.model.provenance.table_sha256 in text
@@ -117,7 +116,7 @@ def test_markers_on_several_tips_are_named(
     text = html.fromstring((tmp_path / "new.html").read_text(encoding="utf-8")).text_content()
     for number, hand in enumerate(HANDS):
         assert f"marker {number} in the frame of {hand} [m]" in text
-    assert found.outliers[0].marker == 1
+    assert found.shown.outliers[0].marker == 1
     assert f"1 on {HANDS[1]}" in text
     exchanged = dc.Measurements(new.q, new.points.flip(1), new.joint_names, on=HANDS[::-1])
     with pytest.raises(MeasurementError, match="other tips"):
@@ -136,7 +135,7 @@ def test_rows_of_the_fit_are_seen_from_its_own_frame(arm: Case, tmp_path: Path) 
     result = dc.calibrate(arm.robot, table, hyperparameters=usual_scales(arm.robot))
     found = made(tmp_path / "report.html", result.model, table)
     assert found.errors["calibrated"].rms < 2.0 * result.left_out_rms
-    assert found.predictions.data.line_numbers[0] == 2
+    assert found.shown.predictions.data.line_numbers[0] == 2
     unseen = arm.test[:SHOWN]
     new = dc.Measurements(unseen.q, unseen.points + torch.tensor([0.3, -0.1, 0.2]), arm.robot.joint_names)
     new = new.with_sessions(["tuesday"] * len(new))
@@ -206,7 +205,7 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command,
     done = command("report", model, "-o", out, "--data", table, *POSITION, "--title", "Cell 7", "--against", "humidity")
     assert (done.code, done.err) == (0, "")
     assert f"report: {out}" in done.out
-    assert "40 poses that the model has not seen" in done.out.replace("\n", " ")
+    assert "40 rows that the model has not seen" in done.out.replace("\n", " ")
     text = out.read_text(encoding="utf-8")
     check_page(text)
     assert "<h1>Cell 7</h1>" in text
@@ -214,7 +213,7 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command,
     assert "Errors against humidity" in text
     alone = command("report", model, "-o", out)
     assert alone.code == 0
-    assert "60 poses of the fit" in alone.out.replace("\n", " ")
+    assert "60 rows of the fit" in alone.out.replace("\n", " ")
 
 
 @pytest.mark.parametrize(
@@ -297,10 +296,17 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     assert own is not None
     tracked = own.table
     wrong = with_attributes(tracked, points=tracked.points + 0.003 * torch.sin(97.0 * tracked.points))
-    found = find_kinds(kind.model, wrong)
-    assert found.deviations.error.whole < 1e-3 < found.judged[0]
-    assert judged(found, 1e-3).startswith("Above")
-    assert judged(find_kinds(kind.model, None), 1e-3).startswith("Within")
+    found = find(kind.model, wrong)
+    assert found.deviations.error.whole < 1e-3 < found.judged.value
+    assert verdict(found, 1e-3).startswith("Above")
+    new = find(kind.model, kind.new)
+    assert new.shown.predictions is not None
+    assert len(new.shown.predictions) == len(tracked) < new.count
+    assert list(new.kinds) == ["position", "socket"]
+    assert f"on {len(tracked)} rows that the model has not seen" in verdict(new)
+    assert "Spread within sockets: " in verdict(new)
+    assert new.errors["calibrated"].rms == pytest.approx(dc.evaluate(kind.model, kind.new).rms)
+    assert verdict(find(kind.model), 1e-3).startswith("Within")
 
 
 def test_a_tolerance_is_a_length(files: tuple[Path, Path], tmp_path: Path, command: Command) -> None:

@@ -71,6 +71,18 @@ class Tracker:
         return criterion
 
 
+def all_of(criteria: Sequence[Criterion]) -> Criterion | None:
+    """Whether all allow a configuration, each asked only where those before it do; None without any."""
+
+    def criterion(q: Tensor) -> Tensor:
+        found = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        for one in criteria:
+            found[found.clone()] = one(q[found])
+        return found
+
+    return criterion if criteria else None
+
+
 def above_floor(robot: Tree, height: float, points: Tensor) -> Criterion:
     """Whether all moving points are above a height in the robot's base frame, m.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import check_limits
+from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
 from diffeo_calib.calibration.planning.knowledge import (
     FREE,
     Known,
@@ -23,11 +23,11 @@ from diffeo_calib.calibration.planning.knowledge import (
     tool_of,
     without_motions,
 )
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, Where
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -296,6 +296,56 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
     if isinstance(given, CalibratedKinematics) and without_positions(given):
         return tuple(one.beside_others() for one in several)
     return several
+
+
+def drawn(
+    given: Tree | CalibratedKinematics,
+    sensors: Sequence[Sensor],
+    count: int,
+    markers: Tensor,
+    *,
+    ranges: Mapping[str, Sequence[float]] | None = None,
+    keep: Criterion | None = None,
+    tracker: Tracker | None = None,
+    **cell: Any,
+) -> Tensor:
+    """Random configurations (M, n), M at least ``count``, in which some sensors can measure, rad or m.
+
+    They are shared by sensors that need the ball in their sockets, those that see a part of the workspace, and others.
+
+    Args:
+        given: a robot, or a model of it. markers: (P, 3) in the frame of the tip, m; the ball last.
+        ranges, keep, tracker, cell: as of :func:`candidates`; the reflector of the tracker is one of the markers.
+
+    Raises:
+        InputError: as there.
+    """
+    base, wheres = torch.eye(4, dtype=torch.float64, device=HOST), list[Where | None]()
+    if isinstance(given, CalibratedKinematics):
+        base, wheres = given.geometry.base, [one.where(given) for one in sensors]
+    held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
+    seen, found = [where for where in wheres if where is not None], []
+    each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
+        (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
+        *((1, None, markers.mean(0), where) for where in seen),
+        (len(held), torch.cat(held) if held else None, markers[-1], None),
+    ]
+    for number, places, marker, where in each:
+        if number:
+            criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
+            found.append(
+                candidates(
+                    given.robot if isinstance(given, CalibratedKinematics) else given,
+                    -(-count * number // len(sensors)),
+                    ranges=({} if where is None else where.ranges) | dict(ranges or {}),
+                    keep=all_of(criteria),
+                    tracker=None if tracker is None else replace(tracker, marker=marker.tolist()),
+                    places=places,
+                    ball=marker,
+                    **cell,
+                )
+            )
+    return torch.cat(found)
 
 
 def _options(

@@ -44,6 +44,14 @@ def parsed_limit(text: str | None, option: str = "--fail-above") -> Limit | None
     return Limit(value / per_unit, unit)
 
 
+def parsed_length(text: str | None, option: str) -> float | None:
+    """A length with its unit in m; None without one."""
+    limit = parsed_limit(text, option)
+    if limit is not None and limit.unit != "m":
+        raise InputError.of(f"{option} {text}", expected="a length, such as 0.15mm")
+    return None if limit is None else limit.value
+
+
 def accept(found: Accuracy, limit: Limit) -> None:
     """Say whether errors are within the limit; exit with a code of its own if they are not."""
     good = found.value <= limit.value

@@ -15,7 +15,7 @@ import typer
 from diffeo_calib.campaign.campaign import Campaign
 from diffeo_calib.campaign.feeds import ID, Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
-from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_limit
+from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
@@ -37,15 +37,13 @@ LOOK_SECONDS = 0.1
 def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
     source = measured_table(given.csv, given.rows, given.units)
-    limit = parsed_limit(given.target, "--target")
-    if limit is not None and limit.unit != "m":
-        raise InputError.of(f"--target {given.target}", expected="a length, such as 0.15mm")
+    goal = parsed_length(given.target, "--target")
     robot, played = load_robot(given.robot), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
-        campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
+        campaign = Campaign(robot, candidates=candidates, goal=goal)
         live = Live(campaign, source, given.robot.tip, journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal

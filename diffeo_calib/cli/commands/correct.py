@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from math import degrees, isnan, radians
 
 import torch
-from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.cli.console import out, plain, progress_bar, say
+from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
@@ -214,18 +213,15 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
     """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
     robot, allowed = kinematics.robot, found.q.isfinite().all(1)
     if bool(allowed.any()):
-        table = Table(title="Corrections", title_justify="left")
-        for column in ("", "median", "max"):
-            table.add_column(column, justify="right" if column else "left")
+        sizes, change = dict[str, Tensor](), found.correction[allowed].abs()
         for tool in tools:
             after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (found.q, found.start))
-            _add_sizes(table, plain(f"{tool.label}, mm"), 1e3 * (after - before).norm(dim=1))
-        change = found.correction[allowed].abs()
+            sizes[f"{tool.label}, mm"] = 1e3 * (after - before).norm(dim=1)
         for joint, name in enumerate(robot.joint_names):
-            turns = robot.periodic[joint]
-            sizes = change[:, joint].rad2deg() if turns else 1e3 * change[:, joint]
-            _add_sizes(table, plain(f"{name}, {'deg' if turns else 'mm'}"), sizes)
-        out.print(table)
+            unit, own = ("deg", change[:, joint].rad2deg()) if robot.periodic[joint] else ("mm", 1e3 * change[:, joint])
+            sizes[f"{name}, {unit}"] = own
+        rows = [[plain(what), f"{float(own.median()):.4f}", f"{float(own.max()):.4f}"] for what, own in sizes.items()]
+        out.print(text_table("Corrections", ["", "median", "max"], rows))
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
     say(*_missed_lines(found, tools, lines))
     few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
@@ -262,10 +258,6 @@ def _sizes(deviations: Tensor) -> tuple[str, str]:
     """Root mean squares over rows (M, 2) of positions and orientations."""
     shift, turn = deviations.square().mean(0).sqrt().tolist()
     return f"{1e3 * shift:.3f} mm", f"{degrees(turn):.4f} deg"
-
-
-def _add_sizes(table: Table, label: str, sizes: Tensor) -> None:
-    table.add_row(label, f"{float(sizes.median()):.4f}", f"{float(sizes.max()):.4f}")
 
 
 def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> Iterator[str]:

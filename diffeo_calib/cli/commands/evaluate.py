@@ -83,7 +83,8 @@ def run(options: EvaluateOptions) -> None:
     for text in judged.causes:
         warn_user(text)
     if limit is not None:
-        accept(accuracy(model, found, used, limit.unit), limit)
+        new, which = (found, "") if bool(used.all()) else (found.rows(~used), " not used in the fit")
+        accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
 def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:

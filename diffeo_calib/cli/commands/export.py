@@ -6,11 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
 
-from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
-from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.console import out, plain, say, text_table
 from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.printed import placement_lines
@@ -196,19 +195,13 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
     if about is None or stands_free(model):  # no position was measured
         about, new = ExpectedError.of(model).whole, "true positions, about"
     title = f"Distance from the model over {Compared.of(model).where}, mm"
-    table = Table(title=title, title_justify="left")
-    table.add_column("export")
-    for column in ("RMS", "max", "cross-validated", *([new] if about is not None else [])):
-        table.add_column(column, justify="right")
+    lines: list[tuple[str, list[float | None]]] = []
     for name, rigid in rows.items():
         left_out = rigid.validated.get(rigid.how)
-        numbers = [rigid.rms, rigid.largest, left_out]
-        if about is not None:
-            numbers.append(hypot(left_out or rigid.rms, about))
-        table.add_row(plain(name), *("" if number is None else f"{1e3 * number:.4f}" for number in numbers))
-    if about is not None:
-        table.add_row("(the model itself)", "", "", "", f"{1e3 * about:.4f}")
-    out.print(table)
+        lines.append((plain(name), [rigid.rms, rigid.largest, left_out, hypot(left_out or rigid.rms, about)]))
+    lines.append(("(the model itself)", [None, None, None, about]))
+    cells = [[name, *("" if one is None else f"{1e3 * one:.4f}" for one in numbers)] for name, numbers in lines]
+    out.print(text_table(title, ["export", "RMS", "max", "cross-validated", new], cells))
     if known is not None and known.geometry_rms is not None and known.diffeomorphic_rms is not None:
         left = f"geometric calibration {1e3 * known.geometry_rms:.4f}, model {1e3 * known.diffeomorphic_rms:.4f}"
         say(f"RMS distance from the measured positions of the fit, mm: {left}")

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from math import isfinite, pi, radians
 from pathlib import Path
+from typing import Any
 
 import torch
-from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, candidates, collision_free
+from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
-from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
-from diffeo_calib.calibration.planning.sensors import Sensor, Where
-from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
+from diffeo_calib.calibration.planning.sensors import Sensor
+from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
@@ -76,7 +75,7 @@ def run(given: PlanOptions) -> None:
         progress("candidates", 0, 1)
         q = configurations(cell.candidates)
         if q is None:
-            q = _drawn(source, sensors, markers, max(cell.draw or DRAWN, count), (cell, table))
+            q = drawn(source, sensors, max(cell.draw or DRAWN, count), markers, **_cell(cell, robot, table))
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = model is not None or any(one.of_frames for one in sensors)
@@ -113,53 +112,24 @@ def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
     return robot, places / table.per_metre if numbers else places
 
 
-def _random(
-    cell: Candidates,
-    robot: Tree,
-    marker: Tensor,
-    count: int,
-    *,
-    places: Tensor | None,
-    table: TableFormat,
-    where: Where | None,
-) -> Tensor:
-    """Random configurations (count, n) that respect the cell, rad or m."""
-    scale, tracker, column = table.per_metre, None, None
-    keep = None if where is None else where.keep
+def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
+    """What random configurations have to respect, in m and rad: arguments of :func:`drawn`."""
+    scale = table.per_metre
     if cell.tracker is None and not (cell.facing is None and cell.cone is None):
         raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
+    found: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
     if cell.tracker is not None:
         position = [x / scale for x in _numbers("--tracker", cell.tracker, (3,))]
         direction = _numbers("--facing", cell.facing or "0,0,1", (3,))
         cone = FACING_HALF_ANGLE_DEG if cell.cone is None else cell.cone
-        tracker = Tracker(position, marker.tolist(), direction, radians(cone))
+        found["tracker"] = Tracker(position, direction=direction, half_angle=radians(cone))
     if cell.column is not None:
-        column = [x / scale for x in _numbers("--column", cell.column, (3, 4))]
-    return candidates(
-        robot,
-        count,
-        ranges=({} if where is None else where.ranges) | _ranges(cell, robot, table),
-        keep=_both(keep, collision_free(robot)) if cell.collisions else keep,
-        tracker=tracker,
-        floor=None if cell.floor is None else cell.floor / scale,
-        column=column,
-        places=places,
-        ball=marker,
-        seed=cell.seed,
-    )
-
-
-def _both(first: Criterion | None, second: Criterion) -> Criterion:
-    """Whether both allow a configuration; the second one is asked only where the first does."""
-    if first is None:
-        return second
-
-    def criterion(q: Tensor) -> Tensor:
-        found = first(q)
-        found[found.clone()] = second(q[found])
-        return found
-
-    return criterion
+        found["column"] = [x / scale for x in _numbers("--column", cell.column, (3, 4))]
+    if cell.floor is not None:
+        found["floor"] = cell.floor / scale
+    if cell.collisions:
+        found["keep"] = collision_free(robot)
+    return found
 
 
 def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list[float]]:
@@ -174,33 +144,6 @@ def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list
         unit = 1 / table.joints_per_metre if not turns.get(name, True) else 1.0
         found[name] = [x * (pi / 180 if turns.get(name) and table.angle == "deg" else unit) for x in numbers]
     return found
-
-
-def _drawn(
-    given: Tree | CalibratedKinematics,
-    sensors: Sequence[Sensor],
-    markers: Tensor,
-    count: int,
-    how: tuple[Candidates, TableFormat],
-) -> Tensor:
-    """Random configurations, shared by sensors that need the ball in their sockets and those that do not."""
-    cell, table = how
-    if isinstance(given, CalibratedKinematics):
-        robot, base, wheres = given.robot, given.geometry.base, [one.where(given) for one in sensors]
-    else:
-        robot, base, wheres = given, torch.eye(4, dtype=torch.float64, device=HOST), []
-    held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
-    seen, found = [where for where in wheres if where is not None], []
-    each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
-        (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
-        *((1, None, markers.mean(0), where) for where in seen),
-        (len(held), torch.cat(held) if held else None, markers[-1], None),
-    ]
-    for number, places, marker, where in each:
-        if number:
-            share = -(-count * number // len(sensors))
-            found.append(_random(cell, robot, marker, share, places=places, table=table, where=where))
-    return torch.cat(found)
 
 
 MOVED = {"base": "the measuring device is", "marker": "the markers are", "both": "device and markers are"}
@@ -218,15 +161,13 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
     """
     more = "" if found.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"
-    table = Table(title=title, title_justify="left", min_width=len(title))
-    for column in (f"{more} poses".strip(), "model", *["held out"] * of_positions):
-        table.add_column(column, justify="right")
-    fewest = 0 if free is None else int((found.expected_rms > OPEN_M).sum())
+    fewest, rows = 0 if free is None else int((found.expected_rms > OPEN_M).sum()), list[list[str]]()
     for count in (*[0] * (not found.assumed and not fewest), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
-        table.add_row(str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions)
-    out.print(table)
+        rows.append([str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions])
+    header = [f"{more} poses".strip(), "model", *["held out"] * of_positions]
+    out.print(text_table(title, header, rows, labels=0, min_width=len(title)))
     if of_positions:
         say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
     if fewest:

@@ -22,7 +22,6 @@ from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.joint_ranges import OutsideRange
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
-from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
@@ -32,14 +31,6 @@ OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
     "rigid motion of all of them; `evaluate --register` with measured positions finds it"
 )
-
-
-def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> None:
-    """Find all mistakes in a table, and warn of rows outside the joint ranges of the fit."""
-    outside = OutsideRange(model)
-    file.check(lambda values: outside.add(values["q"]), lambda part: progress("checking, %", int(100 * part), 100))
-    outside.refuse_other_unit()
-    outside.warn()
 
 
 def counted(blocks: Iterable[Laden], rows: int, progress: Progress) -> Iterator[Laden]:
@@ -73,7 +64,10 @@ def run(given: PredictOptions) -> None:
     prefixes = kinematics.bodies.prefixes(kinematics)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
-        check(file, kinematics, progress)
+        outside = OutsideRange(kinematics)  # all mistakes in the table are found before anything is written
+        file.check(lambda values: outside.add(values["q"]), lambda part: progress("checking, %", int(100 * part), 100))
+        outside.refuse_other_unit()
+        outside.warn()
         laden = counted(file.laden_joints(), file.rows, progress)
         blocks = (_predicted(readings, kinematics, *rows) for rows in laden)
         how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}

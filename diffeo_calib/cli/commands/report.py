@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli.commands.acceptance import parsed_limit
-from diffeo_calib.cli.console import exit_on_interrupt, plain, progress_bar, say
+from diffeo_calib.cli.commands.acceptance import parsed_length
+from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.declarations import ReportOptions
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.analysis.findings import PositionFindings, unseen
-from diffeo_calib.reports.report import judged, words_of, write_report
+from diffeo_calib.reports.analysis.findings import unseen
+from diffeo_calib.reports.html.sentences import advice, verdict
+from diffeo_calib.reports.report import write_report
 
 
 def run(wanted: ReportOptions) -> None:
@@ -17,33 +19,27 @@ def run(wanted: ReportOptions) -> None:
     kinematics, data = load_kinematics(wanted.model), None
     if wanted.data is not None:
         data = table_of(kinematics, wanted.data, wanted.rows, wanted.units).read(kinematics.robot)
-    limit = parsed_limit(wanted.tolerance, "--tolerance")
-    if limit is not None and limit.unit != "m":
-        raise InputError.of(f"--tolerance {wanted.tolerance}", expected="a length, such as 0.15mm")
-    tolerance = None if limit is None else limit.value
-    if tolerance is not None and data is not None and unseen(kinematics, data) is None:
+    tolerance = parsed_length(wanted.tolerance, "--tolerance")
+    if tolerance is not None and data is not None and not bool(unseen(kinematics, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, wanted.output, data, **given, progress=progress)
     say(*provenance_lines(kinematics))
-    words, error = words_of(found), found.deviations.error
-    verdict = f"{judged(found, tolerance)}{words.verdict(found)}"
+    told = verdict(found, tolerance)
     record.add(
         **entries_by_kind(found.kinds),
         expected_error_by_stage_m=dict(found.expected),
-        expected_error=error.entry(),
-        left_out=not found.new,
-        verdict=verdict,
-        advice=list(words.advice(found)),
+        left_out=not found.shown.new,
+        verdict=told,
+        advice=list(advice(found)),
         files={"report": wanted.output},
     )
-    each = "as fitted"
-    if isinstance(found, PositionFindings):
-        record.add(coverage_95=found.predictions.coverage())
-        each = "each predicted by all others"
-    if data is not None and not found.new:
+    if found.shown.predictions is not None:
+        record.add(coverage_95=found.shown.predictions.coverage())
+    if data is not None and not found.shown.new:
+        each = "as fitted" if not found.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(verdict, f"expected absolute error over the joint ranges of the fit: {plain(error.sentence)}")
+    say(told, *expectation_lines(kinematics, None, found.deviations.error))
     say(f"report: {wanted.output}")

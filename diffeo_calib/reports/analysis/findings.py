@@ -1,49 +1,45 @@
-"""Everything that a report says about a calibration, as numbers."""
+"""Everything that a report says about a calibration, as numbers: of rows of any kinds, each in its own unit."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.findings import Outlier, parts
-from diffeo_calib.calibration.judgement import block_text, larger_than_expected, steps_of
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.calibration.findings import Outlier, Part, parts
+from diffeo_calib.calibration.judgement import Accuracy, accuracy, block_text, judge, steps_of
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
-    implausible,
-    impossible,
     place,
     placement_sentences,
+    positions_of,
     residuals,
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
-from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
-from diffeo_calib.reports.analysis.kinds import Findings
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
-from diffeo_calib.sensors.errors import Evaluation
-from diffeo_calib.sensors.known_drift import KnownDrift
+from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places
 
 LOG = logging.getLogger(__name__)
-UNMOVED_MEDIAN_DEVIATIONS = 1.0
-"""Median error in claimed deviations below which nothing can have moved."""
 STEPS = 4
 """Of the analysis, as they are told."""
 PROBE_CONFIGURATIONS = 60
@@ -52,26 +48,93 @@ COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class PositionFindings(Findings):
-    """Numbers of a report about measured positions, or poses, alone.
+class Shown(NamedTuple):
+    """Rows of a report and their errors.
 
     Args:
-        rows: those of the fit.
-        predictions: rows that the model has not seen, or those of its fit, each predicted by all others.
-        repeats: what repeated configurations show; None if there are none.
-        learning_curve: number of rows -> error of others, m; empty if the rows are not known.
-        outliers: rows that look wrong among those of ``predictions``, and ``moved``: what else happened to them.
-        columns: further columns of the table that errors are shown against, by name.
+        errors: stage -> errors of these rows, the model last; empty without rows.
+        q: (N, n) their joint values, and ``lines``: (N,) in the file.
+        new: whether the model has not seen them. predictions: measured positions among them, predicted by a model
+            that has not seen them; None without any.
+        outliers: rows that look wrong, and ``moved``: what else happened to them. devices: what was found from them.
     """
 
+    errors: Mapping[str, Evaluations]
+    q: Tensor
+    lines: Tensor
+    new: bool = False
+    predictions: Predictions | None = None
+    outliers: Sequence[Outlier] = ()
+    moved: Sequence[str] = ()
+    devices: Sequence[str] = ()
+
+
+class OwnErrors(NamedTuple):
+    """Errors of the model on N rows of one kind, joint values (N, n) and lines (N,) of these rows."""
+
+    errors: Evaluation
+    q: Tensor
+    lines: Tensor
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Findings:
+    """Numbers of a report.
+
+    Args:
+        model: the model. stages: kinematics to compare: nominal, geometric, calibrated. rows: those of the fit.
+        shown: the rows that the report shows.
+        repeats: what repeated configurations show; None if there are none.
+        learning_curve: number of rows -> error of others, m; empty if the rows of the fit are not known.
+        columns: further columns of the table that errors are shown against, by name.
+        expected: stage -> RMS error of positions that the model expects over the joint ranges of its rows, m.
+        deviations: what it expects at random configurations there, and at those of the fit.
+        parts: what explains how much. devices: where devices are, and what was found from the rows shown.
+    """
+
+    model: CalibratedKinematics
+    stages: Mapping[str, Kinematics]
     rows: FitRows
-    predictions: Predictions
+    shown: Shown
     repeats: Repeats | None
     learning_curve: Sequence[tuple[int, float]]
-    outliers: Sequence[Outlier]
-    moved: Sequence[str]
     columns: Mapping[str, Tensor]
+    expected: Mapping[str, float]
+    deviations: Deviations
+    parts: Sequence[Part]
+    devices: Sequence[str]
+
+    @cached_property
+    def kinds(self) -> Mapping[str, Mapping[str, Evaluation]]:
+        """Kind -> stage -> errors of the rows shown; empty without rows."""
+        found = self.shown.errors
+        kinds = next(iter(found.values()), ())
+        return {kind: {name: errors[kind] for name, errors in found.items()} for kind in kinds}
+
+    @property
+    def own(self) -> list[OwnErrors]:
+        """Errors of the model, kind by kind."""
+        last = list(self.shown.errors.values())[-1:]
+        each = [(one, found.index[kind].cpu()) for found in last for kind, one in found.items()]
+        return [OwnErrors(one, self.shown.q[rows], self.shown.lines[rows]) for one, rows in each]
+
+    @property
+    def errors(self) -> Mapping[str, Evaluation]:
+        """Errors of measured positions by stage, of a model that has not seen them; empty without any."""
+        kinds = [] if self.shown.predictions is None else self.kinds.values()
+        return next((stages for stages in kinds if next(iter(stages.values())).what == ERRORS), {})
+
+    @property
+    def count(self) -> int:
+        """Number of rows shown."""
+        return sum(len(one.lines) for one in self.own)
+
+    @property
+    def judged(self) -> Accuracy:
+        """The RMS error that is compared with a tolerance."""
+        fitted = not self.shown.new and self.shown.predictions is None
+        own = [] if fitted else [one.errors for one in self.own]
+        return accuracy(self.model, own, "m", self.deviations.error)
 
     @property
     def forecast(self) -> tuple[int, float] | None:
@@ -86,44 +149,36 @@ class PositionFindings(Findings):
         return self.rows.map.explained_by(tool, self.deviations.q[:PROBE_CONFIGURATIONS])
 
     @property
-    def repeatability(self) -> float | None:
-        """As of the class above."""
-        return None if self.repeats is None else self.repeats.deviation
-
-    @property
-    def errors(self) -> Mapping[str, Evaluation]:
-        """Errors of each stage on the rows shown."""
-        return next(iter(self.kinds.values()))
-
-    @property
-    def judged(self) -> tuple[float, str]:
-        """The RMS error of the model on the rows shown, m, which is compared with a tolerance."""
-        *_, own = self.errors.values()
-        return own.rms, "of these rows"
+    def telling(self) -> Repeats | None:
+        """Repeated configurations, if they are enough for one number that speaks of the robot."""
+        return self.repeats if self.repeats is not None and self.repeats.telling else None
 
     @property
     def limit(self) -> float:
         """RMS distance, m, below which no model of the positions can come: repeatability, or the noise of the fit."""
-        if self.repeats is not None and self.repeats.telling:
-            return self.repeats.deviation
+        if self.telling is not None:
+            return self.telling.deviation
         return self.model.bodies.noise_rms(self.model.map.new_noise)
 
 
 def find(
     model: CalibratedKinematics,
-    data: Measurements | None = None,
+    data: Any = None,
     *,
     stages: Mapping[str, Kinematics] | None = None,
+    places: Mapping[str, Places] | None = None,
     against: Sequence[str] = (),
     progress: Progress = silent,
-) -> PositionFindings:
+) -> Findings:
     """Compute everything that a report shows.
 
     Args:
-        model: a calibrated model. data: measurements; rows of the fit, and of a registration, are left out. By default,
-            and if no others are left, the rows of the fit are shown, each predicted by all others. A model with control
-            points does not know these itself: pass them in their order.
-        stages: kinematics to compare, found anew by default.
+        model: a calibrated model. data: rows of any kinds; rows of the fit, and of a registration, are left out. By
+            default, and if no others are left, the rows of the fit are shown: measured positions each predicted by all
+            others, rows of other kinds as fitted. A model with control points does not know its rows: pass them in
+            their order.
+        stages: kinematics to compare, the model last; found anew by default.
+        places: of the devices beside each stage, by its name; by default they are placed on the rows.
         against: further columns of the table of ``data``.
         progress: called as ``progress(task, done, total)``.
 
@@ -134,53 +189,35 @@ def find(
     check_arguments(model, data)
     if data is not None:
         check_rows(model, data)
-        if data.markers != model.markers:
-            fix = "pass the markers that the model predicts, in the same order"
-            raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
-        data = _undrifted(model, place(model, data).aligned(data))
+    own = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
+    measured = None if data is None else positions_of(model, own, data)
+    if measured is not None and measured.markers != model.markers:
+        fix = "pass the markers that the model predicts, in the same order"
+        raise InputError.of("the markers of `data`", expected=model.markers, got=measured.markers, fix=fix)
     progress("analysis", 0, STEPS)
-    rows = FitRows(model, data)
-    predictions = _predictions(rows, model, data)
-    progress("analysis", 1, STEPS)
+    rows = FitRows(model, measured)
     kinematics = stages_of(model, rows) if stages is None else stages
-    *before, own = kinematics
-    seen = predictions.data
-    placed = {name: place(kinematics[name], seen) for name in before}
-    errors = {name: residuals(kinematics[name], at, seen).main for name, at in placed.items()}
-    errors[own] = predictions.errors
-    outliers = predictions.outliers(model)
+    progress("analysis", 1, STEPS)
+    if data is not None and (bool(unseen(model, data.q).any()) or not rows.of_positions):
+        aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
+        shown = _of_table(model, data, measured, own, _errors(data, aligned, kinematics, own, places))
+    elif rows.of_positions:
+        shown = _left_out(model, rows, kinematics)
+    else:
+        shown = Shown({}, rows.q, rows.q[:, 0])
     progress("analysis", 2, STEPS)
-    repeats, curve = _repeats(rows, model, data, kinematics), rows.learning_curve() if rows.known else []
+    noise, curve = float(model.map.new_noise.diagonal().mean().sqrt()), rows.learning_curve() if rows.known else []
+    repeats = None if measured is None else repeats_of(measured, kinematics, noise)
+    if repeats is None and model.registration is None and rows.known:
+        repeats = repeats_of(rows.measurements, kinematics, noise)
+    columns = _columns(None if shown.predictions is None else shown.predictions.data, against)
     progress("analysis", 3, STEPS)
     deviations = Deviations.of(model).planned(model)
-    found = PositionFindings(
-        model=model,
-        stages=kinematics,
-        kinds={predictions.errors.kind: errors},
-        new=not predictions.left_out,
-        devices=placement_sentences(model),
-        expected=expected_errors(model, kinematics, deviations.error),
-        deviations=deviations,
-        parts=parts(model),
-        rows=rows,
-        predictions=predictions,
-        repeats=repeats,
-        learning_curve=curve,
-        outliers=outliers,
-        moved=_moved(model, predictions, outliers),
-        columns=_columns(predictions.data, against),
-    )
+    expected = expected_errors(model, kinematics, deviations.error)
+    devices = [*shown.devices, *placement_sentences(model)]
     progress("analysis", STEPS, STEPS)
-    return found
-
-
-def _undrifted(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
-    """Rows that took no part in the fit as without a drift that the model knows; None if there are no others."""
-    drift = KnownDrift.of(model)
-    if drift is None:
-        return data
-    new = data.rows(~rows_used_in_fit(model, data.q))
-    return drift.aligned(new) if len(new) else None
+    found = shown, repeats, curve, columns, expected, deviations, parts(model), devices
+    return Findings(model, kinematics, rows, *found)
 
 
 def check_arguments(model: object, data: object) -> None:
@@ -192,72 +229,91 @@ def check_arguments(model: object, data: object) -> None:
         raise InputError.of("`data`", expected=expected, got=type(data).__name__)
 
 
-def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:
-    """Those of rows that the model has not seen; if there are none, of the rows of the fit by all others."""
-    new = None if data is None else unseen(model, data)
-    if data is None or new is None:
-        fitted = model.nominal.geometry.markers
-        if model.registration is not None and model.markers != fitted:
-            got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
-            fix = "pass rows that it has not seen, neither in the fit nor in the registration"
-            raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
-        found = Predictions.of_fit(rows)
-        LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
-        return found
-    LOG.info("judged by %d rows it has not seen, %d were used before", len(new), len(data) - len(new))
-    return Predictions.of(model, new)
-
-
-def _repeats(
-    rows: FitRows, model: CalibratedKinematics, data: Measurements | None, stages: Mapping[str, Kinematics]
-) -> Repeats | None:
-    """Repeatability from repeated configurations, in the table or else in the rows of the fit."""
-    noise = float(model.map.new_noise.diagonal().mean().sqrt())
-    repeats = None if data is None else repeats_of(data, stages, noise)
-    if repeats is None and model.registration is None and rows.known:
-        repeats = repeats_of(rows.measurements, stages, noise)
-    return repeats
-
-
-def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
-    """The rows that took no part in the fit, nor in a registration; None if there are none."""
-    new = ~rows_used_in_fit(model, data.q)
+def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """(N,) which configurations took no part in the fit, nor in a registration."""
+    new = ~rows_used_in_fit(model, q)
     if model.registration is not None:
-        placed = model.registration.q.to(data.q)
-        new &= torch.cdist(data.q, placed, p=inf).amin(1) > SAME_CONFIGURATION
-    if not bool(new.any()):
-        return None
-    return data.rows(new)
+        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
+    return new.to(HOST)
 
 
-def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequence[Outlier]) -> list[str]:
-    """Sentences about devices or markers that moved, blocks of wrong rows, and errors larger than expected."""
-    data = predictions.data
-    if predictions.left_out and model.registration is not None:
-        return []  # the rows of its fit are in another place
-    large = predictions.errors.median > UNMOVED_MEDIAN_DEVIATIONS * float(predictions.claimed.nanmedian())
-    steps = steps_of(model, data) if len(outliers) >= gates.LAG_ROWS else []
-    named, text = [step.sentence() for step in steps[:1]], None
-    if data.bodies.perhaps_moved(far=large):
-        named += [sentence(motion.sentence) for motion in motions(model, data)]
-        text = implausible(model, data, predictions.errors)
-    if impossible(model, predictions.errors.median):
-        if not named:
-            refuse_mistakes(model.robot, data)
-        named = [" ".join([*(named or [text or ""]), data.set_up_hint]).strip()]
-    if not named:
-        named = [text or block_text(model, data, list(outliers)) or ""]
-    if not any(named) and not outliers and not predictions.left_out:
-        named = larger_than_expected(model, data, predictions.errors)
-    return [text for text in named if text]
+def _errors(
+    data: Any,
+    aligned: Measurements | None,
+    stages: Mapping[str, Kinematics],
+    own: Places,
+    places: Mapping[str, Places] | None,
+) -> dict[str, Evaluations]:
+    """Errors of all rows by stage.
+
+    Args:
+        data: the rows. aligned: the same in the frame of the model, without its drift, if all are measured positions.
+        own: places of the devices beside the model. places: beside every stage, if they are known.
+    """
+    *before, last = stages
+    found = dict[str, Evaluations]()
+    for name in before:
+        kinematics = stages[name]
+        if aligned is not None:
+            found[name] = residuals(kinematics, place(kinematics, aligned), aligned)
+        else:
+            at = place(kinematics, data) if places is None else places[name]
+            at = replace(at, frames=at.frames or own.frames, ball=own.ball)
+            found[name] = residuals(kinematics, at, data)
+    return found | {last: residuals(stages[last], own, data)}
 
 
-def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:
+def _of_table(
+    model: CalibratedKinematics, data: Any, measured: Measurements | None, own: Places, every: Mapping[str, Evaluations]
+) -> Shown:
+    """Rows that the model has not seen; if there are none, all as fitted.
+
+    Args:
+        measured: their positions in the frame of the model. own: places of the devices. every: errors of all by stage.
+    """
+    mask = unseen(model, data.q)
+    new = bool(mask.any())
+    LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
+    mask = mask if new else ~mask
+    errors = {name: found.rows(mask) for name, found in every.items()}
+    shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
+    seen = None if measured is None or not new else unseen(model, measured.q)
+    if measured is None or seen is None or not bool(seen.any()):
+        return shown
+    judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
+    moved = judged.causes if judged.refusal is None else [judged.refusal]
+    predictions = Predictions.of(model, measured.rows(seen))
+    return shown._replace(predictions=predictions, outliers=predictions.outliers(model), moved=moved)
+
+
+def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, Kinematics]) -> Shown:
+    """The rows of the fit, each predicted by all others."""
+    fitted = model.nominal.geometry.markers
+    if model.registration is not None and model.markers != fitted:
+        got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
+        fix = "pass rows that it has not seen, neither in the fit nor in the registration"
+        raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
+    found = Predictions.of_fit(rows)
+    LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
+    *before, own = stages
+    errors = {name: residuals(stages[name], place(stages[name], found.data), found.data) for name in before}
+    errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))], len(found))
+    outliers, moved = found.outliers(model), list[str]()
+    if model.registration is None:  # else the rows of its fit are in another place
+        steps = steps_of(model, found.data) if len(outliers) >= gates.LAG_ROWS else []
+        moved = [step.sentence() for step in steps[:1]] or [block_text(model, found.data, outliers) or ""]
+    return Shown(errors, found.data.q, found.data.lines, False, found, outliers, list(filter(None, moved)))
+
+
+def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Tensor]:
     """Columns of the table that were asked for, and those whose names speak of time or temperature."""
-    known = data.origin.numeric_columns(data.line_numbers, gaps=True) if isinstance(data.origin, TableOrigin) else {}
+    known = dict[str, Tensor]()
+    if data is not None and isinstance(data.origin, TableOrigin):
+        known = data.origin.numeric_columns(data.line_numbers, gaps=True)
     missing = [name for name in against if name not in known]
     if missing:
-        expected = f"columns of numbers: {', '.join(known)}" if known else "a table that was read from a file"
+        alone = "a table of positions or poses alone, read from a file"
+        expected = f"columns of numbers: {', '.join(known)}" if known else alone
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
     words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]

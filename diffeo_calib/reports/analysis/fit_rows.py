@@ -40,7 +40,10 @@ FEWEST_LEARNED = 15
 
 
 class FitRows:
-    """A model's fit, linearised at its rows.
+    """A model's fit, linearised at its rows; of rows of other kinds than positions alone, only what these show.
+
+    Attributes:
+        of_positions: whether positions, or poses, of all markers were measured in every row.
 
     Args:
         model: calibrated kinematics. One that was registered stands for its fit: the markers are those of the fit.
@@ -54,6 +57,7 @@ class FitRows:
         registered = own.registration is not None
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
+        self.of_positions = not model.ball and self.map.slopes is None
         self._measured = None
         if measured is not None and measured.q.shape == self.q.shape and measured.points[0].numel() == self.map.m:
             self._measured = measured if torch.equal(measured.q.to(HOST), self.q) else None
@@ -69,7 +73,7 @@ class FitRows:
     @property
     def known(self) -> bool:
         """Whether the measured values of the rows are known."""
-        return self._measured is not None or self.map.data is None
+        return self.of_positions and (self._measured is not None or self.map.data is None)
 
     @property
     def in_one_place(self) -> bool:
@@ -213,7 +217,8 @@ class FitRows:
     @cached_property
     def _linearised(self) -> tuple[Tensor, Linearisation]:
         at_controls = self.map.data is None  # rows with places or payloads of their own
-        return self.map.geodesic.linearised_value(None if at_controls else self.q)
+        value, at = self.map.geodesic.linearised_value(None if at_controls else self.q)
+        return value, at if self.map.slopes is None else at.projected(self.map.slopes)
 
     @property
     def predicted(self) -> Tensor:

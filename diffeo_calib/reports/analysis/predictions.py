@@ -82,8 +82,7 @@ class Predictions:
 
     def found_shares(self) -> Tensor:
         """Shares of errors inside the regions that claim :data:`SHARES`."""
-        limits = SHARES.new_tensor([chi2_above(1.0 - share, 3) for share in SHARES.tolist()])
-        return (known(self.squares)[:, None] <= limits).double().mean(0)
+        return SHARES.new_tensor([self.coverage(share) for share in SHARES.tolist()])
 
     def inside(self, share: float = 0.95) -> tuple[int, int]:
         """Number of errors inside the regions that claim ``share``, and of all."""

@@ -81,14 +81,17 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     if not still:
         return None
     repeated = torch.tensor(still, dtype=labels.dtype, device=labels.device)
-    first, repeatability, squares, freedom = [], [], 0.0, 0
+    first, repeatability, squares, freedom = [], list[Tensor](), 0.0, 0
     accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
     for label in repeated.tolist():
         rows = (labels == label).nonzero()[:, 0]
         middle = points[rows].nanmean(0)
-        found, square, own = _repeatability((points[rows] - middle).norm(dim=-1))
-        repeatability.append(found)
-        squares, freedom = squares + square, freedom + own
+        distances = (points[rows] - middle).norm(dim=-1)  # (n, B), NaN for hidden markers
+        seen = (~distances.isnan()).sum(0)
+        variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
+        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max())
+        squares += float(distances.square().nansum())
+        freedom += int((seen - 1).clamp(min=0).sum())
         first.append(int(rows[0]))
         for name, places in predicted.items():
             accuracy[name].append(largest_known((middle - places[rows].mean(0)).norm(dim=-1), 0))
@@ -99,15 +102,3 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         {name: torch.stack(values) for name, values in accuracy.items()},
         (squares / freedom) ** 0.5,
     )
-
-
-def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
-    """The largest RP of all markers, m, the sum of squares, m^2, and its degrees of freedom.
-
-    Args:
-        distances: (n, B) of the measurements from their means, m; NaN for hidden markers.
-    """
-    seen = (~distances.isnan()).sum(0)
-    variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
-    largest = (distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max()
-    return largest, float(distances.square().nansum()), int((seen - 1).clamp(min=0).sum())

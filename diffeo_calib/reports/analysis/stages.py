@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,8 +12,7 @@ from torch import Tensor
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_robustly
-from diffeo_calib.calibration.planning.candidates import candidates
-from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
 from diffeo_calib.common.device import HOST, seeded
@@ -33,23 +32,14 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     and markers are those that fit the model best.
     """
     rows = FitRows(model) if rows is None else rows
-
-    if rows.in_one_place and model.registration is None and model.rigid_errors is not None:
+    if not rows.in_one_place or model.registration is not None or model.rigid_errors is None:
+        geometries = nominal_kinematics(model).geometry, geometric_kinematics(model).geometry
+    else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they were shown when the model was fitted
-            registration = register_robustly(model.robot, rows.measurements)
-            geometric = identify(registration.geometry, rows.q, rows.points)
-        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: model}
-    return {**placed_stages(model), CALIBRATED: model}
-
-
-def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:
-    """The stages of a calibration with base and markers where they fit the model best."""
-    return {
-        NOMINAL: nominal_kinematics(model).geometry.points,
-        GEOMETRIC: geometric_kinematics(model).geometry.points,
-        CALIBRATED: model,
-    }
+            registered = register_robustly(model.robot, rows.measurements).geometry
+            geometries = registered, identify(registered, rows.q, rows.points).geometry
+    return {NOMINAL: geometries[0].points, GEOMETRIC: geometries[1].points, CALIBRATED: model}
 
 
 CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
@@ -79,28 +69,30 @@ class Deviations:
     @classmethod
     def of(cls, model: CalibratedKinematics, seed: int = 0) -> Deviations:
         """The deviations of a model at random configurations."""
-        q, fitted = configurations(model, CONFIGURATIONS, seed), model.configurations.to(HOST)
-        fitted = fitted[:: -(-len(fitted) // MEASURED)]
+        fitted = model.configurations.to(HOST)
+        low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
+        draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+        q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
         return cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
 
     def planned(self, model: CalibratedKinematics, seed: int = 0) -> Deviations:
-        """The same with poses that would lower the deviations most."""
-        options = torch.cat([self.q, *_seen_configurations(model, CONFIGURATIONS, seed)])
-        return replace(self, next=plan(model, options, NEXT, target=self.q[:TARGETS]))
+        """The same with poses that would lower the deviations most, if it is known what measured the rows of the fit.
 
-
-def _seen_configurations(model: CalibratedKinematics, count: int, seed: int) -> Iterator[Tensor]:
-    """(count, n) random configurations for each sensor that cannot measure everywhere, such as a camera.
-
-    Those of the fit where hardly any others can be measured.
-    """
-    for sensor in sensor_of(model):
-        where = sensor.where(model)
+        A device that cannot measure everywhere, such as a camera, and where hardly any configuration can be drawn at
+        random, is asked for those of the fit.
+        """
         try:
-            if where is not None:
-                yield candidates(model.robot, count, keep=where.keep, ranges=where.ranges, seed=seed)
-        except InputError:
-            yield model.configurations.to(HOST)
+            sensors = sensor_of(model)
+        except InputError:  # a file of an early version
+            return self
+        options = [self.q]
+        for sensor in sensors:
+            if sensor.where(model) is not None or sensor.places_in(model.geometry.base) is not None:
+                try:
+                    options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool, seed=seed))
+                except InputError:
+                    options.append(model.configurations.to(HOST))
+        return replace(self, next=plan(model, torch.cat(options), NEXT, target=self.q[:TARGETS]))
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
@@ -108,11 +100,3 @@ def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     q = q.to(model.configurations.device)
     covariance = model.bodies.predicted(model, q, noise=False).places
     return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
-
-
-def configurations(model: CalibratedKinematics, count: int, seed: int) -> Tensor:
-    """(count, n) random configurations in the joint ranges of a model's fit, within the robot's limits."""
-    fitted = model.configurations.to(HOST)
-    low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
-    draws = torch.rand(count, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
-    return low + draws * (high - low)

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
@@ -25,13 +25,8 @@ from diffeo_calib.reports.plots.style import (
     ORANGE,
     PURPLE,
     Frame,
-    single_panel,
 )
 from diffeo_calib.robots.tree import Tree
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 FOLDER = Path(__file__).parent
 
@@ -138,14 +133,19 @@ VARIABLES |= {ORANGE: "orange", BLUE: "blue", GREEN: "green", PURPLE: "purple"}
 """Colour of a figure -> the variable of the page's style that replaces it."""
 
 
-def picture(figure: Figure, name: str, label: str) -> Picture:
-    """A figure as part of a page.
+def panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: Frame = FRAME, **how: Any) -> Picture:
+    """A picture of one panel, drawn by ``draw(axes, *what, **how)``.
 
     Args:
-        figure: the figure. name: distinguishes its elements from those of other figures. label: what it shows.
+        name: distinguishes its elements from those of other panels. label: what it shows.
     """
     from matplotlib import rc_context  # noqa: PLC0415  # slow to import, needed for figures only
+    from matplotlib.figure import Figure  # noqa: PLC0415
 
+    (width, height), left, top, bottom, right = frame
+    figure = Figure(figsize=frame.size)
+    share = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
+    draw(figure.add_axes(share), *what, **how)
     text = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
@@ -181,13 +181,6 @@ def _with_classes(svg: str, name: str) -> str:
     svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
     rules = "".join(f".{key}{{{style}}}" for style, key in styles.items())
     return svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg
-
-
-def panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: Frame = FRAME, **how: Any) -> Picture:
-    """A picture of one panel, drawn by ``draw(axes, *what, **how)``."""
-    figure, axes = single_panel(frame)
-    draw(axes, *what, **how)
-    return picture(figure, name, label)
 
 
 def listed(values: Tensor, digits: int) -> list[list[float]]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from math import isfinite
-from typing import Any
 
 import torch
 
@@ -17,10 +15,11 @@ from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
-from diffeo_calib.reports.analysis.findings import PositionFindings
+from diffeo_calib.reports.analysis.findings import Findings, OwnErrors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.kinds import Findings
+from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
+from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import (
     Picture,
@@ -47,7 +46,7 @@ from diffeo_calib.reports.plots.joints import (
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.payload import payload_sentence
-from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
@@ -81,38 +80,35 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     """Errors of one kind of rows by stage, and orientation errors in degrees if there are any."""
     some = next(iter(stages.values()))
-    unit, per_unit = some.shown
-    header = ["stage", f"RMS [{unit}]", "median", "95 %", "max"]
-    header += ["RMS [deg]", "median", "95 %", "max"] * (some.angles is not None)
-    rows = []
-    for name, own in stages.items():
-        cells = [f"{per_unit * value:.3f}" for value in (own.rms, own.median, own.p95, own.max)]
-        angles = (own.angle_rms, own.angle_median, own.angle_p95, own.angle_max)
-        rows.append([name, *cells, *(f"{angle:.4f}" for angle in angles if angle is not None)])
+    units = [some.shown[0], *["deg"] * (some.angles is not None)]
+    header = ["stage", *(name for unit in units for name in (f"{SIZES[0]} [{unit}]", *SIZES[1:]))]
+    rows = [
+        [name, *(f"{size:.3f}" for size in own.sizes), *(f"{size:.4f}" for size in own.angle_sizes)]
+        for name, own in stages.items()
+    ]
     return Table(f"{some.title} by stage", header, rows)
 
 
-def sections(found: Findings, rows: str, progress: Progress = silent) -> Iterator[Section]:
-    """Contents of the page before its record; ``rows`` are those shown, in words."""
-    yield how_good(found, rows)
-    measured = measured_where, measured_why, trust, repeatability
-    every: Any = measured if isinstance(found, PositionFindings) else (where, other_why)
-    for number, section in enumerate(every, 1):
-        progress("drawing", number, 1 + len(every))
+def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
+    """Contents of the page before its record."""
+    every = how_good, where, why, trust, repeatability
+    for number, section in enumerate(every):
+        progress("drawing", number, len(every))
         yield section(found)
     if found.devices:
         see = "Where devices and sockets stand, and what was found from the rows shown as the model did not know it."
         yield Section("devices", "Devices", see, text=[printable(line) for line in found.devices])
 
 
-def how_good(found: Findings, rows: str) -> Section:
+def how_good(found: Findings) -> Section:
     """Errors of every kind of rows by stage."""
+    limit = None if found.repeats is None else found.repeats.deviation
     pictures = [
         picture
         for number, stages in enumerate(found.kinds.values())
-        for picture in stage_pictures(stages, f"-{number}", found.repeatability)
+        for picture in stage_pictures(stages, f"-{number}", limit)
     ]
-    see = f"Errors on {rows}: each stage should lie well to the left of the one before it."
+    see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
     see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
     notes = [
@@ -121,7 +117,7 @@ def how_good(found: Findings, rows: str) -> Section:
     ]
     present = {next(iter(stages.values())).what for stages in found.kinds.values()}
     notes += [text for what, text in FLATTERING.items() if what in present]
-    if found.kinds and not found.new:
+    if found.kinds and not found.shown.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses (--data) are the stronger proof."
@@ -130,15 +126,17 @@ def how_good(found: Findings, rows: str) -> Section:
 
 
 def where(found: Findings) -> Section:
-    """What the model expects of its positions: by stage, and against every joint."""
-    robot, error = found.model.robot, found.deviations.error
+    """What the model expects of its positions, by stage and against every joint; the poses to measure next."""
+    robot, error, plan = found.model.robot, found.deviations.error, found.deviations.next
     label = "Error that the model itself expects against {}: dashed anywhere in the measured ranges, solid where "
     words, what = f"{label}it was measured.", (draw_expected, robot)
     pictures = [
         panel(f"expected-{k}", words.format(printable(name)), *what, k, found.deviations, key=k == 0)
         for k, name in enumerate(robot.joint_names)
     ]
-    see = (
+    scene = None if found.shown.predictions is None else _scene(found.stages, found.shown.predictions)
+    arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
+    see = arrows * (scene is not None) + (
         "The error that the model itself expects, without the noise of a measurement: "
         f"{rough_millimetres(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
         f"ranges {printable(error.sentence)}"
@@ -146,14 +144,8 @@ def where(found: Findings) -> Section:
     if found.model.own_frame:
         see += ", after a rigid fit, because no device says where the robot stands"
     rows = [[name, millimetres(value)] for name, value in found.expected.items()]
-    table = Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)
-    return Section("where", "Where", f"{see}.", [table], None, pictures)
-
-
-def measured_where(found: PositionFindings) -> Section:
-    """The same with the workspace in space, and the poses to measure next."""
-    own, robot, plan = where(found), found.model.robot, found.deviations.next
-    tables, notes = list(own.tables), [*sentences.unlike_poses(found), *sentences.worst_range(found)]
+    tables = [Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)]
+    notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     if plan is not None:
         q = plan.q[plan.rank.argsort()]
         caption = f"Where to measure next: {len(q)} poses that would lower the expected error most"
@@ -164,15 +156,13 @@ def measured_where(found: PositionFindings) -> Section:
             f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the "
             "ranges. Check them in the robot's cell before you move there."
         )
-    see = f"Arrows point from the predicted to the measured place, with one scale in all views. Below: {own.see}"
-    return replace(own, see=see, tables=tables, scene=_scene(found), notes=notes)
+    return Section("where", "Where", f"{see}.", tables, scene, pictures, notes)
 
 
-def _scene(found: PositionFindings) -> Scene:
-    seen = found.predictions
+def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> Scene:
     there = ~seen.measured.isnan().any(2)  # of the sightings
     step, errors = -(-int(there.sum()) // MOST_POINTS), {}
-    *before, (last, _) = found.stages.items()
+    *before, (last, _) = stages.items()
     for name, kinematics in before:
         predicted = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
         errors[name] = listed((seen.measured - predicted)[there][::step], SCENE_DECIMALS + 2)
@@ -181,44 +171,27 @@ def _scene(found: PositionFindings) -> Scene:
 
 
 def why(found: Findings) -> Section:
-    """What each part of the model explains, and sag and waves of its gears in words."""
+    """What each part of the model explains: sag, waves of its gears, and corrections of the geometry."""
     left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in found.parts)
     frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
-    picture = panel("parts", label, draw_parts, found.parts, frame=frame)
-    notes = [
-        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
-        "several joints, task space on the place of the marker."
-    ]
-    notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
-    return Section("why", "Why", "What each part of the model explains.", pictures=[picture], notes=notes)
-
-
-def other_why(found: Findings) -> Section:
-    """The same for rows that are not of positions alone."""
-    own = why(found)
-    note = (
-        "Coverage, learning curve, repeatability and the workspace in space are not shown: they compare measured "
-        "positions with claimed ones, and rows in sockets and readings measure none. The bands of transmission errors "
-        "are those of models of positions."
-    )
-    return replace(own, notes=[*own.notes, note])
-
-
-def measured_why(found: PositionFindings) -> Section:
-    """The same with transmission errors and corrections of the geometry."""
-    own, pictures = why(found), list[Picture]()
+    pictures = [panel("parts", label, draw_parts, found.parts, frame=frame)]
     for joint, name in enumerate(found.model.robot.joint_names):
-        label = f"{name}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
+        label = (
+            f"{printable(name)}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
+        )
         pictures.append(panel(f"transmission-{joint}", label, draw_transmission, found.model, found.rows, joint))
     see = (
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
         "meshing; a wide band means that the joint was measured too little there."
     )
-    note = "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
-    notes = [*own.notes, note]
-    tables = [_corrections(found.model, found.rows)]
-    return replace(own, see=see, tables=tables, pictures=[*own.pictures, *pictures], notes=notes)
+    notes = [
+        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
+        "several joints, task space on the place of the marker.",
+        *(f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)),
+        "Corrections are open where the rows do not tell them; those of parallel axes stand for one another.",
+    ]
+    return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
@@ -252,69 +225,68 @@ MOST_REPEATS = 12
 """Repeated poses that are listed."""
 
 
-def trust(found: PositionFindings) -> Section:
+def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
-    see = sentences.judged(found)
-    tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
-    tables.append(_largest(found))
-    notes = list(found.moved)
-    registered = found.model.registration
+    shown, registered = found.shown, found.model.registration
+    tables = [_outliers(shown.outliers, found.model.on)] if shown.outliers else []
+    tables += [_largest(found, own) for own in found.own]
+    notes = list(shown.moved)
     if registered is not None:
         notes.append(
             f"The model was registered anew with {registered.rows} rows, RMS {millimetres(registered.rms_after)} mm; "
             f"each predicted by the others {millimetres(registered.left_out_rms)} mm."
         )
-    elif not notes:
+    elif not notes and shown.predictions is not None:
         notes.append("No device or marker moved, and no block of rows is wrong.")
-    if not found.outliers and not found.moved:
+    if not shown.outliers and not shown.moved and shown.predictions is not None:
         notes.append(
             "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
             "by the model's own deviations."
         )
-    return Section("trust", "Can I trust it", see, tables, None, [*_certainty(found), *_residuals(found)], notes)
-
-
-def _certainty(found: PositionFindings) -> Iterator[Picture]:
-    """Errors that the model expects, and those with fewer rows."""
-    label = "Found against claimed shares of errors; on the diagonal the claims are true."
-    yield panel("coverage", label, draw_coverage, found.predictions)
+    pictures = list[Picture]()
+    if shown.predictions is not None:
+        label = "Found against claimed shares of errors; on the diagonal the claims are true."
+        pictures.append(panel("coverage", label, draw_coverage, shown.predictions))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
-        limit = found.limit if found.repeats else None
-        yield panel("learning", label, draw_learning_curve, found.learning_curve, found.forecast, limit)
+        what = found.learning_curve, found.forecast, found.limit if found.repeats else None
+        pictures.append(panel("learning", label, draw_learning_curve, *what))
+    pictures += _residuals(found)
+    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
 
 
-def _residuals(found: PositionFindings) -> Iterator[Picture]:
-    """Errors against the row, time and temperature, and every joint."""
-    seen, robot = found.predictions, found.model.robot
-    columns = {"row": seen.data.line_numbers.double(), **found.columns}
-    for number, (name, values) in enumerate(columns.items()):
-        label = f"Errors against {printable(name)}, their RMS dashed: a trend is a drift."
-        missing = int((~values.isfinite()).sum())
-        label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
-        yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name), key=number == 0)
-    for joint, name in enumerate(robot.joint_names):
-        values = joint_values(robot, joint, seen.data.q[:, joint])
-        label = f"Errors against {printable(name)}, their RMS dashed."
-        what = values, seen, joint_label(robot, joint)
-        yield panel(f"residuals-joint-{joint}", label, draw_residuals, *what, key=False)
+def _residuals(found: Findings) -> Iterator[Picture]:
+    """Errors of every kind against the row, time and temperature, and every joint."""
+    robot = found.model.robot
+    for place, (errors, q, lines) in enumerate(found.own):
+        what = errors.title if len(found.own) > 1 else "Errors"
+        columns = {"row": lines.double(), **(found.columns if errors.what == ERRORS else {})}
+        for number, (name, values) in enumerate(columns.items()):
+            label = f"{what} against {printable(name)}, their RMS dashed: a trend is a drift."
+            missing = int((~values.isfinite()).sum())
+            label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
+            given = values, errors, printable(name)
+            yield panel(f"residuals-{place}-{number}", label, draw_residuals, *given, key=number == 0)
+        for joint, name in enumerate(robot.joint_names):
+            label = f"{what} against {printable(name)}, their RMS dashed."
+            given = joint_values(robot, joint, q[:, joint]), errors, joint_label(robot, joint)
+            yield panel(f"residuals-{place}-joint-{joint}", label, draw_residuals, *given, key=False)
 
 
-def _largest(found: PositionFindings) -> Table:
-    """The rows with the largest errors, beside what the model expects there."""
-    seen, robot = found.predictions, found.model.robot
-    errors, body = seen.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
+def _largest(found: Findings, own: OwnErrors) -> Table:
+    """The rows of one kind with the largest errors, of positions beside what the model expects there."""
+    (unit, per_unit), seen = own.errors.shown, found.shown.predictions
+    errors, body = own.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
     order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
-    joints = joint_values_by_row(robot, seen.data.q[order])
-    lines = [
-        ["error [mm]", *(millimetres(float(errors[row])) for row in order)],
-        ["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)],
-        *joints,
-    ]
-    if seen.measured.shape[1] > 1:
+    lines = [[f"error [{unit}]", *(f"{per_unit * float(errors[row]):.3f}" for row in order)]]
+    what = f"Largest: {own.errors.label}" if len(found.own) > 1 else "Largest errors"
+    if seen is not None and own.errors.what == ERRORS and len(seen) == len(own.lines):
+        what += ", and what the model expects of a measurement there"
+        lines.append(["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)])
+    lines += joint_values_by_row(found.model.robot, own.q[order])
+    if own.errors.errors.shape[1] > 1:
         lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
-    header = ["row", *(str(int(seen.data.line_numbers[row])) for row in order)]
-    return Table("Largest errors, and what the model expects of a measurement there", header, lines)
+    return Table(what, ["row", *(str(int(own.lines[row])) for row in order)], lines)
 
 
 def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
@@ -327,7 +299,7 @@ def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
     return Table(caption, ["row", "marker", "off by [mm]", "why"], rows, numeric=False)
 
 
-def repeatability(found: PositionFindings) -> Section:
+def repeatability(found: Findings) -> Section:
     """Figures of ISO 9283, where poses were repeated."""
     repeats = found.repeats
     if repeats is None:
@@ -362,7 +334,8 @@ def repeatability(found: PositionFindings) -> Section:
 
 def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
     """Everything needed to make the model again."""
-    lines = [*_origin(model.provenance, data_sha256), *_fit(model), *_places(model)]
+    lines = [*_origin(model.provenance, data_sha256), *_fit(model), "robot base in the measuring frame, 4 x 4 [m]:"]
+    lines += [*matrix_lines(model.geometry.base), *model.bodies.place_lines(model)]
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)
 
 
@@ -394,10 +367,3 @@ def _fit(model: CalibratedKinematics) -> Iterator[str]:
         certified = isfinite(summary.coupling_residual) and isfinite(summary.end_residual)
         yield f"optimum       {residuals if certified else 'without certificate: fewer control points than rows'}"
         yield f"status        {summary.status}; scales: {summary.scales}"
-
-
-def _places(model: CalibratedKinematics) -> Iterator[str]:
-    """Where the base and the markers, or the measured frame, were found."""
-    yield "robot base in the measuring frame, 4 x 4 [m]:"
-    yield from matrix_lines(model.geometry.base)
-    yield from model.bodies.place_lines(model)

@@ -9,9 +9,10 @@ import torch
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
-from diffeo_calib.reports.analysis.findings import PositionFindings
+from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
+from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
@@ -31,62 +32,97 @@ MISCALIBRATION_PROBABILITY = 0.05
 """Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""
 
 
-def rows_of(found: PositionFindings) -> str:
-    """Source of the errors of a report, in words."""
-    count = len(found.predictions)
-    if found.predictions.left_out:
-        return f"{count} poses of the fit, each predicted by {'all' if found.rows.whole else 'hundreds of'} others"
-    return f"{count} poses that the model has not seen"
+def rows_of(found: Findings, count: int | None = None) -> str:
+    """Source of the errors of a report, or of ``count`` of them, in words."""
+    count = found.count if count is None else count
+    if not found.kinds:
+        return "none, because no rows were passed"
+    if found.shown.new:
+        return f"{count} rows that the model has not seen"
+    if not found.errors:
+        return f"{count} rows of its own fit"
+    return f"{count} rows of the fit, each predicted by {'all' if found.rows.whole else 'hundreds of'} others"
 
 
-def verdict(found: PositionFindings) -> str:
-    """The result in one line."""
-    *before, (_, own) = found.errors.items()
-    stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
-    many = len(found.predictions) >= ENOUGH_FOR_P95
-    most = f"95 % of errors are below {1e3 * own.p95:.3f} mm;" if many else f"The largest is {1e3 * own.max:.3f} mm;"
-    telling = found.repeats is not None and found.repeats.telling
-    what = "repeatability" if telling else "noise of a measurement"
-    found_on = f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {rows_of(found)}"
-    return f"{found_on}. {most} {what} about {1e3 * found.limit:.3f} mm."
+def verdict(found: Findings, tolerance: float | None = None) -> str:
+    """The result in one line: whether a tolerance, m, is kept, errors by stage, and those of every other kind."""
+    stages = {name: one.rms for name, one in found.errors.items()} or found.expected
+    *before, (_, own) = stages.items()
+    listed = "".join(f"{1e3 * value:.2f} mm {printable(name)}, " for name, value in before)
+    text = f"{listed}{1e3 * own:.3f} mm calibrated"
+    if not found.errors:
+        text = f"{text}: RMS errors of positions that the model expects over the joint ranges of its rows."
+    else:
+        *_, errors = found.errors.values()
+        many = errors.count >= ENOUGH_FOR_P95
+        most = f"95 % of errors are below {1e3 * errors.p95:.3f}" if many else f"The largest is {1e3 * errors.max:.3f}"
+        what = "noise of a measurement" if found.telling is None else "repeatability"
+        text = f"{text} (RMS), on {rows_of(found, len(errors.errors))}. {most} mm;"
+        text = f"{text} {what} about {1e3 * found.limit:.3f} mm."
+    text = " ".join([text, "; ".join(f"{name}: {value} RMS" for name, value in _others(found))]).strip()
+    if tolerance is None:
+        return text
+    judged = found.judged
+    within = "Within" if judged.value <= tolerance else "Above"
+    return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * judged.value:.3f} mm RMS {judged.of}. {text}"
 
 
-def figures(found: PositionFindings) -> Iterator[tuple[str, str]]:
+def _others(found: Findings) -> Iterator[tuple[str, str]]:
+    """Errors of the model in rows of other kinds than measured positions: what they are, and their RMS."""
+    for own, _, _ in found.own:
+        if not found.errors or own.what != ERRORS:
+            unit, per_unit = own.shown
+            yield own.title, f"{per_unit * own.rms:.3f} {unit}"
+
+
+def figures(found: Findings) -> Iterator[tuple[str, str]]:
     """Name and value of the numbers at the top."""
-    for name, errors in found.errors.items():
-        yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
-    *_, own = found.errors.values()
-    if own.angle_rms is not None:
-        yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
-    if len(found.predictions) >= ENOUGH_FOR_P95:
-        yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
-    inside, count = found.predictions.inside()
-    yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
+    if not found.errors:
+        for name, value in found.expected.items():
+            yield f"expected error, {name}", f"{1e3 * value:.3f} mm"
+    else:
+        for name, errors in found.errors.items():
+            yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
+        *_, own = found.errors.values()
+        if own.angle_rms is not None:
+            yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
+        if own.count >= ENOUGH_FOR_P95:
+            yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
+    for name, value in _others(found):
+        yield f"{name}, RMS", value
+    if found.shown.predictions is not None:
+        inside, count = found.shown.predictions.inside()
+        yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
     error = found.deviations.error
     if error.whole > FAR_RATIO * error.measured:
         apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
         yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
-    if found.repeats is not None and found.repeats.telling:
+    if found.telling is not None:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"
 
 
-def advice(found: PositionFindings) -> Iterator[str]:
+def advice(found: Findings) -> Iterator[str]:
     """Next steps, the most important first."""
-    yield from found.moved
-    if found.outliers:
-        wrong = {one.row for one in found.outliers}
-        good = [row for row in range(len(found.predictions)) if row not in wrong]
-        text = f"{len(wrong)} of {len(found.predictions)} rows look wrong: check them, see below"
-        rest = found.predictions.errors.errors[good].square().nanmean().sqrt()
+    shown = found.shown
+    yield from shown.moved
+    if shown.predictions is not None and shown.outliers:
+        wrong = {one.row for one in shown.outliers}
+        good = [row for row in range(len(shown.predictions)) if row not in wrong]
+        text = f"{len(wrong)} of {len(shown.predictions)} rows look wrong: check them, see below"
+        rest = shown.predictions.errors.errors[good].square().nanmean().sqrt()
         yield f"{text}; without them {1e3 * float(rest):.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
     yield from still_joints(found)
-    if found.moved:
+    if shown.moved:
         return
-    *others, (_, own) = found.errors.items()
-    before, rival = min(others, key=lambda stage: stage[1].rms)
-    if own.rms >= rival.rms:
-        yield f"The model is no better than the {before} one on these rows: measure more poses."
+    for stages in found.kinds.values():
+        *others, (_, own) = stages.items()
+        before, rival = min(others, key=lambda stage: stage[1].rms)
+        if own.rms >= rival.rms:
+            of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
+            yield f"{of} model is no better than the {before} one on these rows: measure more poses."
+    if found.kinds and not shown.new and not found.errors:
+        yield "These are rows of the fit: pass rows that the model has not seen (--data)."
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
     if found.forecast is None:
@@ -104,7 +140,7 @@ def advice(found: PositionFindings) -> Iterator[str]:
         yield f"More poses like these will hardly help: twice as many ({rows}) would bring {change}."
 
 
-def _unless_planned(found: PositionFindings) -> str:
+def _unless_planned(found: Findings) -> str:
     """That planned poses help where more of the same do not, if they do."""
     plan = found.deviations.next
     now, then = (0.0, 0.0) if plan is None else (float(plan.expected_rms[count]) for count in (0, -1))
@@ -114,7 +150,7 @@ def _unless_planned(found: PositionFindings) -> str:
     return f"; those listed under Where lower the error expected anywhere in the joint ranges {lower}"
 
 
-def unlike_poses(found: PositionFindings) -> Iterator[str]:
+def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
     expected, model = found.deviations, found.model
     if expected.error.whole < FAR_RATIO * expected.error.measured:
@@ -137,7 +173,7 @@ def unlike_poses(found: PositionFindings) -> Iterator[str]:
         yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."
 
 
-def still_joints(found: PositionFindings) -> Iterator[str]:
+def still_joints(found: Findings) -> Iterator[str]:
     """A sentence about joints that never moved in the fit: their errors are not known."""
     q, robot = found.rows.q, found.model.robot
     for joint, name in enumerate(robot.joint_names):
@@ -150,9 +186,11 @@ def still_joints(found: PositionFindings) -> Iterator[str]:
             )
 
 
-def worst_range(found: PositionFindings) -> Iterator[str]:
+def worst_range(found: Findings) -> Iterator[str]:
     """A sentence about the part of a joint's range with the largest errors, if they are unusual."""
-    seen, robot = found.predictions, found.model.robot
+    seen, robot = found.shown.predictions, found.model.robot
+    if seen is None:
+        return
     lengths, worst = 1e3 * largest_known(seen.errors.errors), (BAD_RATIO * 1e3 * seen.errors.rms, "")
     for joint, name in enumerate(robot.joint_names):
         values = joint_values(robot, joint, seen.data.q[:, joint])
@@ -169,9 +207,14 @@ def worst_range(found: PositionFindings) -> Iterator[str]:
         yield worst[1]
 
 
-def judged(found: PositionFindings) -> str:
+def judged(found: Findings) -> str:
     """Whether the claimed regions can be believed, as far as the number of rows tells."""
-    inside, count = found.predictions.inside()
+    if found.shown.predictions is None:
+        return (
+            "No position was measured that the model has not seen, so the regions that it claims cannot be compared "
+            "with errors."
+        )
+    inside, count = found.shown.predictions.inside()
     low, high = binomial_band(count, 0.95, MISCALIBRATION_PROBABILITY)
     if inside < low:
         what = "these are too small: widen the model's deviations, or measure more poses like these"

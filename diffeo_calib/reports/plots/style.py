@@ -60,7 +60,7 @@ def panels(count: int, columns: int = 2, title: str = "") -> tuple[Figure, list[
 
 
 class Frame(NamedTuple):
-    """Size and margins of a single panel, inches."""
+    """Size and margins of a single panel, inches: drawn faster than one whose layout is solved."""
 
     size: tuple[float, float] = PANEL
     left: float = 0.6
@@ -70,16 +70,6 @@ class Frame(NamedTuple):
 
 
 FRAME = Frame()
-
-
-def single_panel(frame: Frame = FRAME) -> tuple[Figure, Axes]:
-    """A figure of one panel with fixed margins, which is drawn faster than one whose layout is solved."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
-
-    (width, height), left, top, bottom, right = frame
-    figure = Figure(figsize=frame.size)
-    share = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
-    return figure, figure.add_axes(share)
 
 
 def finish(axes: Axes, *, x: str, y: str, logarithmic: Sequence[str] = ()) -> None:

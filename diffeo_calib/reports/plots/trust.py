@@ -14,6 +14,7 @@ from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.plots.joints import in_bins, joint_label, joint_values
 from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, dots, finish, legend, note, panels
+from diffeo_calib.sensors.errors import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,20 +58,22 @@ def residuals(model: CalibratedKinematics, data: Measurements | None = None, tit
     """Errors against row and every joint; arguments as :func:`uncertainty`."""
     predictions = _predictions(model, data)
     figure, grid = panels(1 + model.robot.n, columns=3, title=title)
-    draw_residuals(grid[0], predictions.data.line_numbers.double(), predictions, "row")
+    draw_residuals(grid[0], predictions.data.line_numbers.double(), predictions.errors, "row")
     for joint, axes in enumerate(grid[1:]):
         values = joint_values(model.robot, joint, predictions.data.q[:, joint])
-        draw_residuals(axes, values, predictions, joint_label(model.robot, joint))
+        draw_residuals(axes, values, predictions.errors, joint_label(model.robot, joint))
     return figure
 
 
-def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: str, *, key: bool = True) -> None:
-    """Distances of measured from predicted places against a column of numbers (N,); with ``key`` lines are named.
+def draw_residuals(axes: Axes, values: Tensor, errors: Evaluation, label: str, *, key: bool = True) -> None:
+    """Errors of N rows against a column of numbers (N,); with ``key`` lines are named.
 
     Rows without a value, NaN, are left out.
     """
-    there = values.isfinite()
-    values, lengths = values[there], 1e3 * largest_known(predictions.errors.errors)[there]
+    unit, per_unit = errors.shown
+    lengths = per_unit * largest_known(errors.errors)
+    there = values.isfinite() & lengths.isfinite()
+    values, lengths = values[there], lengths[there]
     dots(axes, values, lengths, colour=BLUE)
     if len(values) >= FEWEST_BINNED and float(values.max()) > float(values.min()):
         middles, groups = in_bins(values, lengths)
@@ -80,7 +83,7 @@ def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: 
         if key:
             legend(axes, loc="upper right")
     axes.set_ylim(bottom=0)
-    finish(axes, x=label, y="error [mm]")
+    finish(axes, x=label, y=f"error [{unit}]")
 
 
 def learning_curve(model: CalibratedKinematics, title: str = "") -> Figure:
