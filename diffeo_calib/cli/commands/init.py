@@ -50,7 +50,7 @@ def run(given: InitOptions) -> None:
 
 def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
     folder = output.parent
-    yield Choice("csv", relpath(csv, folder), "the table")
+    yield Choice("csv", relpath(csv, folder), "; ".join(["the table", *sheet.notes]))
     yield Choice("robot", relpath(urdf, folder), "the URDF")
     base, tip, (joints, how), why = _chain(urdf, sheet)
     rows = proposals.rows_in(csv, sheet, joints)

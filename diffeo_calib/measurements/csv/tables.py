@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,22 +12,23 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import (
     LARGEST_NUMBER,
     BadCells,
     Block,
-    CsvLines,
-    Mistakes,
-    fill_hidden,
+    Hideable,
     find_columns,
     number,
+    number_hint,
+    numbers_in,
     parse,
-    read_cells,
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
-from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
+from diffeo_calib.measurements.poses import ANGLE_UNITS, LEVER
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class TableOrigin:
         try:
             if self.sha256 is None or file_sha256(self.path) != self.sha256:
                 return {}
-            header, rows = read_cells(self.path, self.columns.table.sep)
+            header, rows = read_cells(self.path, self.columns.table.sep, self.columns.names)
         except (OSError, MeasurementError):
             return {}
         cells = dict(rows)
@@ -82,14 +83,15 @@ class TableOrigin:
             return {}
         found = {}
         for place, name in enumerate(header):
-            cells_here = [row[place].strip() or "nan" for row in wanted]
-            values = [number(cell, self.columns.table.decimal) for cell in cells_here]
+            values = numbers_in([row[place] for row in wanted], self.columns.table.decimal)
             there = [value for value in values if not gaps or value is None or not math.isnan(value)]
             if there and all(value is not None and math.isfinite(value) for value in there):
                 found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
         return found
 
 
+FEW_ROWS = 2000
+"""Rows among which those of a marker that was not seen are looked for."""
 ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 
@@ -113,22 +115,58 @@ class TableFile(CsvLines):
     """
 
     def __init__(self, path: Path, columns: Columns, texts: Mapping[str, bool] = {}) -> None:  # not changed
-        super().__init__(path, columns.table.sep)
+        needed = [name for name, needed in texts.items() if needed]
+        super().__init__(path, columns.table.sep, [*columns.names, *needed])
         self.columns, self.texts, self.rows = columns, texts, 0
+        self._words: dict[str, list[int]] = {}
 
-    def read(self) -> tuple[Values, dict[str, list[str]], list[int]]:
+    def read(self, *, zeros: bool = True) -> tuple[Values, dict[str, list[str]], list[int]]:
         """The numbers and the texts of all rows, and the line number of each.
+
+        Args:
+            zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there.
 
         Raises:
             MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
         Warns:
-            DiffeoCalibWarning: values that look as if they were in another unit.
+            DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
+                numbers; rows that are left out because no marker was seen.
         """
         blocks = list(self._checked())
         texts = {name: [text for block in blocks for text in block.texts[name]] for name in blocks[0].texts}
         lines = [line for block in blocks for line in block.lines]
-        return self.columns.to_si(torch.cat([block.numbers for block in blocks])), texts, lines
+        numbers = torch.cat([block.numbers for block in blocks])
+        markers = self.columns.hideable[: len(self.columns.triples)]
+        for own in markers if zeros else ():
+            self._hide_zeros(numbers, own, lines)
+        if markers and not self.columns.all_hidden:
+            seen = ~torch.stack([numbers[:, own.values].isnan().all(1) for own in markers]).all(0)
+            kept = seen.nonzero()[:, 0].tolist()
+            gone = [line for line, shows in zip(lines, seen.tolist(), strict=True) if not shows]
+            if gone:
+                warn_user(f"file '{self.path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
+            numbers, lines = numbers[kept], [lines[row] for row in kept]
+            texts = {name: [own[row] for row in kept] for name, own in texts.items()}
+        return self.columns.to_si(numbers), texts, lines
+
+    def _hide_zeros(self, numbers: Tensor, own: Hideable, lines: Sequence[int]) -> None:
+        """Write NaN where a marker is at 0, 0, 0 though it never comes near: a device that does not see it says so.
+
+        One such row may be the origin of the frame: then all others must be farther from it than from one another.
+        """
+        points, q = numbers[:, own.values[:3]], numbers[:, : len(self.columns.joints)]
+        lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)][:FEW_ROWS]
+        if not bool(lost.any()) or len(seen) < 2:
+            return
+        apart = torch.cdist(seen, seen).fill_diagonal_(math.inf).amin(1)
+        limit = apart.median() if len(q[lost].unique(dim=0)) > 1 else apart.amax()
+        if bool(seen.norm(dim=1).amin() > limit):
+            for place in (*own.values, *own.deviations):
+                numbers[lost, place] = math.nan
+            at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
+            names = few([self.columns.names[k] for k in own.values[:3]])
+            warn_user(f"file '{self.path}': {names} are 0, 0, 0 in line {at}, far from other rows: taken as not seen")
 
     def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
         """Find all mistakes, count the rows, and show blocks to ``each``; errors and warnings as in :meth:`read`."""
@@ -155,26 +193,75 @@ class TableFile(CsvLines):
         MeasurementError for anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the
         whole file first.
         """
-        wanted, decimal, hideable = self.columns.names, self.columns.table.decimal, self.columns.hideable
+        wanted, decimal = self.columns.names, self.columns.table.decimal
         named = [name for name, needed in self.texts.items() if needed or name in self.header]
         places = find_columns(self.path, self.header, [*wanted, *named], self.sep)
-        mistakes = Mistakes(self.path, wanted, decimal, markers=len(self.columns.triples))
+        self._check_units()
+        self._words = {}
+        unreadable, missing = BadCells(), BadCells()
         for lines in self.blocks(ROWS_AT_ONCE):
-            whole = mistakes.without_ragged(lines, len(self.header))
-            cells = [[cells[column] for column in places[: len(wanted)]] for _, cells in whole]
-            numbers, hidden = parse(cells, decimal), []
-            if numbers is None and hideable:
-                hidden = fill_hidden(cells, hideable, all_hidden=self.columns.all_hidden)
-                numbers = parse(cells, decimal)
+            cells = [[row[column] for column in places[: len(wanted)]] for _, row in lines]
+            numbers = parse(cells, decimal)
             if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
-                mistakes.add([line for line, _ in whole], cells)
-            elif not mistakes:
-                if hidden:
-                    numbers[tuple(zip(*hidden, strict=True))] = math.nan
+                numbers = self._with_gaps([line for line, _ in lines], cells, unreadable, missing)
+            if lines and not (self.ragged or unreadable.first or missing.first):
                 own = zip(named, places[len(wanted) :], strict=True)
                 found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
                 yield Block(numbers, found, [line for line, _ in lines])
-        mistakes.raise_first()
+        if unreadable.first:
+            raise unreadable.error(self.path, "a number", number_hint(unreadable.first[2], decimal))
+        if missing.first:
+            large = math.isfinite(number(missing.first[2], decimal) or 0.0)
+            expected = f"a number below {LARGEST_NUMBER:g} in size" if large else "a finite number"
+            hint = " (all cells of a hidden marker or frame are empty)" * bool(self.columns.hideable)
+            raise missing.error(self.path, expected, f"remove or repair these lines{hint}")
+
+    def _with_gaps(
+        self, lines: Sequence[int], rows: Sequence[Sequence[str]], unreadable: BadCells, missing: BadCells
+    ) -> Tensor:
+        """Numbers of rows, NaN in the columns of hidden markers; other cells without a number are added to the bad."""
+        texts = [*zip(*rows, strict=True)]
+        found = [numbers_in(column, self.columns.table.decimal) for column in texts]
+        known = [[math.nan if value is None else value for value in column] for column in found]
+        numbers = torch.tensor(known, dtype=torch.float64, device=HOST).T.reshape(len(rows), -1)
+        bad = ~(numbers.abs() < LARGEST_NUMBER)  # NaN too
+        excused, shows = torch.zeros_like(bad), torch.zeros_like(bad[:, 0])
+        hideable = self.columns.hideable
+        kinds = numbers.isnan(), numbers.abs() >= LARGEST_NUMBER  # of one kind: others are damage
+        seen = [~torch.stack([kind[:, own.values].all(1) for kind in kinds]).any(0) for own in hideable]
+        for own, here in zip(hideable, seen, strict=True):
+            excused[:, [*own.values, *own.deviations]] |= ~here[:, None]
+            shows |= here
+        for own, here in zip(hideable, seen, strict=True):
+            excused[:, own.deviations] &= ~here[:, None]
+        if hideable and not self.columns.all_hidden:
+            excused[:, len(self.columns.joints) :] |= ~shows[:, None]  # the row is left out
+        for row, place in bad.nonzero().tolist():
+            line, text = lines[row], rows[row][place]
+            if found[place][row] is None:
+                unreadable.add(line, self.columns.names[place], text)
+            elif not excused[row, place]:
+                missing.add(line, self.columns.names[place], text)
+            elif text.lower() not in ("", "nan"):
+                self._words.setdefault(text, []).append(line)
+        return numbers.masked_fill(bad, math.nan)
+
+    def _check_units(self) -> None:
+        """Raise MeasurementError where the file states another unit of a wanted column than it is read with."""
+        columns, table = self.columns, self.columns.table
+        slides = zip(columns.joints, columns.prismatic.tolist(), strict=True)
+        read = {name: ("joint_length", table.joint_unit) if slide else ("angle", table.angle) for name, slide in slides}
+        for key, group in columns.groups.items():
+            option = "rotation_angle" if key == "rotation_std" else "length"
+            read |= {name: (option, group.unit) for name in group.names if isinstance(group.unit, str)}
+        for name, (option, unit) in read.items():
+            stated = stated_unit(name, self.units)
+            guessed = option == "angle" and not columns.kinds_known  # the joint may be prismatic
+            if stated is not None and stated != unit and not (guessed and stated not in ANGLES):
+                what = f"file '{self.path}', column '{shown(name)}'"
+                usual = stated in (*UNITS_PER_METRE, *ANGLE_UNITS)
+                fix = f"pass {option}={stated!r}, or convert" if usual else "convert the column"
+                raise MeasurementError.of(what, expected=f"{unit}, as stated", got=f"{stated} in its header", fix=fix)
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
@@ -193,6 +280,13 @@ class TableFile(CsvLines):
             unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
             self.rows += len(block.lines)
             yield block
+        notes = self.decided
+        if self._words:
+            words = " and ".join(f"'{shown(text)}' ({len(at)})" for text, at in self._words.items())
+            at = few(sorted({line for own in self._words.values() for line in own}))
+            notes.append(f"cells that hold {words} are taken as empty (line {at})")
+        if notes:
+            warn_user(f"file '{self.path}': {'; '.join(notes)}")
         if largest is not None:
             for text in columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
