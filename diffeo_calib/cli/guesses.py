@@ -9,7 +9,7 @@ from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, numbers_in
-from diffeo_calib.measurements.csv.lines import LONGEST_LINE, CsvLines
+from diffeo_calib.measurements.csv.lines import ALL, CsvLines
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -59,14 +59,13 @@ class Sheet:
 
     Args:
         sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
-        rows: how many rows were looked at. notes: what the reader decided.
+        notes: what the reader decided.
     """
 
     sep: str
     decimal: str
     header: tuple[str, ...]
     numbers: tuple[str, ...]
-    rows: int
     notes: tuple[str, ...] = ()
 
 
@@ -77,7 +76,7 @@ def guess_sheet(path: Path) -> Sheet:
         file = CsvLines(path, sep)
         try:
             with file:
-                rows = [cells for block in file.blocks(LONGEST_LINE) for _, cells in block][:ROWS_LOOKED_AT]
+                rows = [cells for block in file.blocks(ALL) for _, cells in block][:ROWS_LOOKED_AT]
         except MeasurementError as error:
             reasons.append((len(file.header), error))
             continue
@@ -85,7 +84,7 @@ def guess_sheet(path: Path) -> Sheet:
         for decimal in (mark for mark in DECIMALS if mark != sep):
             numbers = dict.fromkeys(name for name, texts in columns if _readable(texts, decimal))
             names = tuple(name for name, _ in columns)
-            found.append(Sheet(sep, decimal, names, tuple(numbers), len(rows), tuple(file.decided)))
+            found.append(Sheet(sep, decimal, names, tuple(numbers), tuple(file.notes)))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):

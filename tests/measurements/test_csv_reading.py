@@ -89,7 +89,7 @@ WRONG_FILES: dict[str, tuple[str | bytes, dict[str, Any], tuple[str, ...]]] = {
     "misspelt": (HEADER, {"joints": ["Q1", "q22"]}, ("no column ['Q1', 'q22']", "['q1', 'q2'", "mean q1", "mean q2")),
     "missing": (HEADER, {"position": ["x", "y", "height"]}, ("no column ['height']", "written in the header")),
     "separator": (SEMICOLONS + "1;2;3;4;5\n", {}, ("single column", "q1;q2;x", "pass sep=';'")),
-    "one column": ("nothing\n1\n", {}, ("single column", "check the file")),
+    "one column": ("nothing\n1\n", {}, ("no column", "the columns ['nothing']")),
     "decimal comma": (
         SEMICOLONS + "1;2;3;4;5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n",
         {"sep": ";"},

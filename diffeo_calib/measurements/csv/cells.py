@@ -11,14 +11,12 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -50,7 +48,7 @@ class Block(NamedTuple):
 
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
-_PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
+_PLAIN = re.compile(r"[0-9+\-.eE]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
 
 
@@ -59,43 +57,30 @@ def repeated(names: Sequence[str]) -> list[str]:
     return [name for name, count in Counter(names).items() if count > 1]
 
 
-@dataclass
-class BadCells:
-    """Cells that are not what they should be: the first one (line, column, text) and the lines of all."""
+def bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str, fix: str) -> MeasurementError:
+    """Error about cells, each a line, a column and a text, that are not what they should be.
 
-    first: tuple[int, str, str] | None = None
-    count: int = 0
-    lines: list[int] = field(default_factory=list)
-
-    def add(self, line: int, name: str, text: str) -> None:
-        """Add a cell: its line, the name of its column, its text.
-
-        Of the cells of one line, a wrong one is named rather than an empty one beside it.
-        """
-        if self.first is None or (self.first[0] == line and text and not self.first[2]):
-            self.first = (line, name, text)
-        self.count += 1
-        if line not in self.lines[-1:]:
-            self.lines.append(line)
-
-    def error(self, path: Path, expected: str, fix: str) -> MeasurementError:
-        """Error that names the first of the cells and the lines of the next ones."""
-        line, name, text = self.first or (0, "", "")
-        where = f" (and {self.count - 1} more, on line {few(self.lines[1:] or [line])})" if self.count > 1 else ""
-        what = f"file '{path}', line {line}, column '{shown(name)}'{where}"
-        got = shown(repr(text)) if text else "an empty cell"
-        return MeasurementError.of(what, expected=expected, got=got, fix=fix)
+    It names the first, but of one line a wrong one rather than an empty one, and the lines of the next ones.
+    """
+    line, name, text = next((cell for cell in cells if cell[0] == cells[0][0] and cell[2]), cells[0])
+    others = list(dict.fromkeys(other for other, _, _ in cells if other != line)) or [line]
+    where = f" (and {len(cells) - 1} more, on line {few(others)})" if len(cells) > 1 else ""
+    got = shown(repr(text)) if text else "an empty cell"
+    return MeasurementError.of(
+        f"file '{path}', line {line}, column '{shown(name)}'{where}", expected=expected, got=got, fix=fix
+    )
 
 
 def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
     """Return the position of every wanted column in the header."""
     missing = [name for name in wanted if name not in header]
-    if missing and len(header) == 1:
-        raise _one_column(path, header[0], sep)
     if missing:
         what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
         fix = _near(missing, [name for name in header if name not in wanted])
-        if header == [str(k + 1) for k in range(len(header))]:
+        likely = max(";,\t| ", key=header[0].count)
+        if len(header) == 1 and likely in header[0]:
+            got, fix = f"a single column {shown(repr(header[0]))} without {sep!r}", f"pass sep={likely!r}"
+        elif header == [str(k + 1) for k in range(len(header))]:
             fix = "the file has no header line: name its columns by their places, such as '1', '2', '3'"
         raise MeasurementError.of(what, got=got, fix=fix)
     twice = [name for name in repeated(header) if name in wanted]
@@ -105,28 +90,13 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
     return [header.index(name) for name in wanted]
 
 
-def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
-    """Error for a header with a single column: most likely the separator is wrong."""
-    counts = {other: text.count(other) for other in ";,\t| " if other != sep}
-    likely = max(counts, key=lambda other: counts[other])
-    fix = f"pass sep={likely!r}" if counts[likely] else "check the file"
-    got = f"a single column {shown(repr(text))}"
-    return MeasurementError.of(f"file '{path}', header", expected=f"columns separated by {sep!r}", got=got, fix=fix)
-
-
 def _near(missing: Sequence[str], free: Sequence[str]) -> str:
     """Which of the columns that no other name matches may be meant; "_", "joint" and case do not count."""
     names = {_bare(name): name for name in free if len(name) <= LONGEST_NAME}
-    near = {
-        name: difflib.get_close_matches(_bare(name), names, n=2)
-        for name in missing[:MOST_NAMES]
-        if len(name) <= LONGEST_NAME
-    }
-    hints = [
-        f"for '{shown(name)}', did you mean {' or '.join(shown(names[m]) for m in found)}"
-        for name, found in near.items()
-        if found
-    ]
+    hints = []
+    for name in [name for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME]:
+        found = [shown(names[near]) for near in difflib.get_close_matches(_bare(name), names, n=2)]
+        hints += [f"for '{shown(name)}', did you mean {' or '.join(found)}"] * bool(found)
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
@@ -136,25 +106,12 @@ def _bare(name: str) -> str:
     return lowered.replace("joint", "").replace("_", "") or lowered
 
 
-def parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
-    """The numbers of cells, (B, c); None if some are none, or look like none."""
-    if not rows:
-        return torch.empty(0, 0, dtype=torch.float64, device=HOST)
-    text = "\n".join(cell for row in rows for cell in row)
-    if decimal != ".":
-        text = text.replace(".", "?").replace(decimal, ".")  # a point is not part of a number here
-    if not _PLAIN.fullmatch(text):
-        return None
-    try:
-        values = torch.tensor([float(cell) for cell in text.split("\n")], dtype=torch.float64, device=HOST)
-    except ValueError:
-        return None
-    whole = len(values) == sum(map(len, rows))  # otherwise a cell holds a line break
-    return values.view(len(rows), -1) if whole else None
-
-
 def numbers_in(texts: Sequence[str], decimal: str) -> list[float | None]:
     """The numbers of a column, see :func:`number`; "1,481" is one where another cell such as "1,481.25" proves it."""
+    plain = texts if decimal == "." else [text.replace(".", "?").replace(decimal, ".") for text in texts]
+    if _PLAIN.fullmatch("".join(plain)):
+        with suppress(ValueError):
+            return [float(text) for text in plain]
     grouped = any(_GROUP[decimal] in text and number(text, decimal) is not None for text in texts)
     return [number(text, decimal, grouped=grouped) for text in texts]
 

@@ -20,7 +20,7 @@ from itertools import combinations, islice
 from math import isnan
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO
 
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.cells import number, repeated
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
-LONGEST_LINE = 1 << 24
-"""Characters; a file with longer lines is no table, and a device may have no line ends at all."""
+ALL = 1 << 40
+"""Rows of a whole file."""
 AT_ONCE = 1 << 16
 """Bytes that are decoded together."""
 HEAD = 200
@@ -40,39 +40,36 @@ HEAD = 200
 COMMENTS = "#", "%", "//"
 """Marks that begin a comment."""
 BINARY = {
-    b"PK\x03\x04": "a spreadsheet or an archive (.xlsx, .ods, .zip)",
-    b"\xd0\xcf\x11\xe0": "a spreadsheet (.xls)",
-    b"\x93NUMPY": "an array of numpy (.npy)",
-    b"MATLAB": "a file of MATLAB (.mat)",
-    b"\x89HDF": "an HDF5 file",
-    b"\x1f\x8b": "compressed (.gz)",
-    b"%PDF": "a PDF",
+    b"PK\3\4": "a spreadsheet",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet",
+    b"\x93NUMPY": "an array",
+    b"MATLAB": "MATLAB",
 }
 """First bytes of files that are no text, and what they are."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
-ANGLES = {"rad": "rad", "mrad": "mrad", "deg": "deg", "°": "deg"}
+ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
 """Units as they are written, and their names."""
-_OTHERS = "s", "ms", "us", "min", "h", "kg", "g", "n", "nm", "°c", "c", "k", "v", "px", "pixel", "%", "-", "none"
-_UNIT = re.compile(
-    rf"[\[(<{{]?\s*({'|'.join(map(re.escape, (*LENGTHS, *ANGLES, *_OTHERS)))})\s*[\])>}}]?", re.IGNORECASE
+OTHERS = (
+    "s",
+    "sec",
+    "ms",
+    "us",
+    "min",
+    "h",
+    "kg",
+    "g",
+    "n",
+    "nm",
+    "°c",
+    "c",
+    "k",
+    "v",
+    "px",
+    "pixel",
+    "%",
+    "-",
+    "none",
 )
-_WHOLE = {"degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "metre": "m", "meter": "m", "sec": "s"}
-"""Units in full, and how they are shortened."""
-
-
-class Head(NamedTuple):
-    """Where the rows of a file begin.
-
-    Args:
-        header: names of the columns. last: number of the last line before the rows. extra: empty cells at the end of
-            rows. units: by name of column, of a row of units. notes: what was decided.
-    """
-
-    header: list[str]
-    last: int
-    extra: int
-    units: dict[str, str]
-    notes: list[str]
 
 
 class CsvLines:
@@ -86,24 +83,19 @@ class CsvLines:
     Attributes:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
-        notes: what was decided, in words.
 
     Raises:
         MeasurementError: a file that cannot be opened or read, is no text or no valid CSV, has no row, or lines of
             different lengths; on entering or while it is read.
     """
 
-    header: list[str]
-    units: dict[str, str]
-
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
         self.path, self.sep, self._wanted = path, sep, wanted
-        self.notes: list[str] = []
+        self.header, self.units = list[str](), dict[str, str]()
+        self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
+        self._notes, self._skipped = list[str](), list[int]()
         self._stack = ExitStack()
         self._file: TextIOWrapper
-        self.header = []
-        self.ragged: list[tuple[int, int]] = []
-        self._skipped: list[int] = []
 
     def __enter__(self) -> Self:
         with self._stack as stack, self._read():  # closed if the header cannot be read
@@ -119,8 +111,8 @@ class CsvLines:
             if not lines:
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
-            self.header, self._last, self._extra, self.units, notes = find_header(lines, self._wanted)
-            self.notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig") + notes
+            self._notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig")
+            self._find_header(lines)
             self._stack = stack.pop_all()
         return self
 
@@ -134,46 +126,38 @@ class CsvLines:
         return min(self._file.buffer.tell() / size, 1.0) if size else 0.0
 
     @property
-    def decided(self) -> list[str]:
-        """The notes, and which lines between the rows were skipped."""
+    def notes(self) -> list[str]:
+        """What was decided, in words; after a pass through the rows also which lines between them were skipped."""
         skipped = f"{len(self._skipped)} line(s) with comments or nothing skipped (line {few(self._skipped)})"
-        return self.notes + [skipped] * bool(self._skipped)
+        return self._notes + [skipped] * bool(self._skipped)
 
     def blocks(self, rows: int) -> Iterator[Lines]:
-        """The lines below the header that have its number of cells, up to ``rows`` at once, from the first one."""
-        self.ragged, self._skipped, count, expected = [], [], 0, len(self.header)
+        """The lines below the header, up to ``rows`` at once, from the first one at every call."""
+        self._skipped, count, expected = [], 0, len(self.header)
         lines = (line for line in self._cells() if line[0] > self._last)
         while block := list(islice(lines, rows)):
-            self._skipped += [line for line, cells in block if _is_comment(cells) or not any(cells)]
-            block = [(line, cells) for line, cells in block if any(cells) and not _is_comment(cells)]
-            count += len(block)
-            whole = [
-                (line, cells[:expected])
-                for line, cells in block
-                if len(cells) in (expected, expected + self._extra) and not any(cells[expected:])
-            ]
-            kept = {line for line, _ in whole}
-            self.ragged += [(line, len(cells)) for line, cells in block if line not in kept]
-            yield whole
-        if self.ragged:
-            what = f"file '{self.path}', line {few([line for line, _ in self.ragged])}"
-            fix = "repair these lines (a cell that holds the separator must be quoted)"
-            cells = f"{expected} cells as in the header"
-            raise MeasurementError.of(what, expected=cells, got=self.ragged[0][1], fix=fix)
+            kept = [(line, cells) for line, cells in block if any(cells) and not _is_comment(cells)]
+            self._skipped += sorted({line for line, _ in block} - {line for line, _ in kept})
+            sizes = expected, expected + self._extra
+            bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
+            if bad:
+                what = f"file '{self.path}', line {few([line for line, _ in bad])}"
+                fix = "repair these lines (a cell that holds the separator must be quoted)"
+                raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
+            count += len(kept)
+            if kept:
+                yield [(line, cells[:expected]) for line, cells in kept]
         if not count:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
 
     def _open(self) -> BinaryIO:
-        path = self.path
         try:
-            return path.open("rb")
-        except FileNotFoundError as error:
-            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-            raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
+            return self.path.open("rb")
         except OSError as error:
-            fix = "pass the name of a readable file"
-            raise MeasurementError.of(f"file '{path}' cannot be opened ({error.strerror})", fix=fix) from error
+            what = f"file '{self.path}' " + ("does not exist" if not self.path.exists() else "cannot be opened")
+            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
+            raise MeasurementError.of(f"{what} ({error.strerror})", fix=fix) from error
 
     def _encoding(self, file: BinaryIO) -> str:
         """Of the text; MeasurementError if the file is none."""
@@ -197,7 +181,8 @@ class CsvLines:
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and stripped cells of every line that is not blank."""
         line = 0
-        reader = csv.reader(self._texts(), delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
+        self._file.seek(0)
+        reader = csv.reader(self._file, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
         try:
             with self._read():
                 for cells in reader:
@@ -221,16 +206,43 @@ class CsvLines:
             what = f"file '{self.path}' cannot be read to its end ({error.strerror})"
             raise MeasurementError.of(what, fix="copy it to another disk first") from error
 
-    def _texts(self) -> Iterator[str]:
-        """The lines of the file as text, from the first one."""
-        self._file.seek(0)
-        number = 0
-        while text := self._file.readline(LONGEST_LINE):
-            number += 1
-            if len(text) == LONGEST_LINE:
-                what = f"file '{self.path}', line {number} has more than {LONGEST_LINE} characters"
-                raise MeasurementError.of(what, fix="pass a table with one configuration per line")
-            yield text
+    def _find_header(self, lines: Lines) -> None:
+        """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
+
+        It is the first line with a name for every cell of the rows, or two lines together; if it lacks a wanted name,
+        the last line before the rows that has them all.
+        """
+        counts = [0 if _is_comment(cells) else _numbers(cells) for _, cells in lines]
+        sizes = Counter(len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count)
+        width = max(sizes, key=lambda size: sizes[size], default=0)
+        rows = [k for k, (_, cells) in enumerate(lines) if counts[k] and len(cells) == width]
+        usual = sorted(counts[k] for k in rows)[len(rows) // 2] if rows else 0
+        start = next((k for k in rows if 2 * counts[k] > usual), len(lines))
+        filled = max((place + 1 for k in rows for place, cell in enumerate(lines[k][1]) if cell), default=0)
+        place, header = _named(lines, start, range(filled, width + 1))
+        wanted, counted = {*self._wanted}, [str(k + 1) for k in range(filled)]
+        for k, (_, cells) in enumerate(lines[: max(start, 1)] if not wanted <= {*header} else []):
+            for names in (cells, _uncommented(cells, width)):
+                if wanted <= {*names}:
+                    place, header = k, names
+        if place < 0 < start and not wanted <= {*counted} and not _is_comment(lines[start - 1][1]):
+            place, header = start - 1, lines[start - 1][1]
+        while place < 0 and start - 1 in rows:
+            start -= 1  # few numbers, but no line names the columns
+        skipped = [line for line, _ in lines[: start if place < 0 else place]]
+        if skipped:
+            self._notes.append(f"line {few(skipped)} before the {'rows' if place < 0 else 'header'} skipped")
+        if place < 0:
+            header, place = counted, start - 1
+            self._notes.append(f"no header line: columns are named by their places, 1 to {filled}")
+        while header and not header[-1]:
+            header = header[:-1]
+        below = next((line for line in lines[place + 1 :] if not _is_comment(line[1])), (0, [""]))
+        self._last = lines[place][0] if place >= 0 else 0
+        if _is_units(below[1]):
+            self._notes.append(f"line {below[0]} holds units")
+            self._last, self.units = below[0], dict(zip(header, map(unit_of, below[1]), strict=False))
+        self.header, self._extra = header, max(width - len(header), 0)
 
 
 def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[str], Lines]:
@@ -240,47 +252,7 @@ def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[s
         MeasurementError: as :class:`CsvLines`.
     """
     with CsvLines(path, sep, wanted) as file:
-        return file.header, [line for block in file.blocks(LONGEST_LINE) for line in block]
-
-
-def find_header(lines: Lines, wanted: Sequence[str]) -> Head:
-    """The header among the first lines of a file, as most rows of numbers and the wanted names have it.
-
-    It is the first line with a name for every cell of the rows, or two lines together; if it lacks a wanted name, the
-    last line before the rows that has them all.
-    """
-    counts = [0 if _is_comment(cells) else _numbers(cells) for _, cells in lines]
-    sizes = Counter(len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count)
-    width = max(sizes, key=lambda size: sizes[size], default=0)
-    rows = [k for k, (_, cells) in enumerate(lines) if counts[k] and len(cells) == width]
-    usual = sorted(counts[k] for k in rows)[len(rows) // 2] if rows else 0
-    start = next((k for k in rows if 2 * counts[k] > usual), len(lines))
-    filled = max((place + 1 for k in rows for place, cell in enumerate(lines[k][1]) if cell), default=0)
-    place, header = _named(lines, start, range(filled, width + 1))
-    if not {*wanted} <= {*header}:
-        for k, (_, cells) in enumerate(lines[: max(start, 1)]):
-            for names in (cells, _uncommented(cells, width)):
-                if wanted and {*wanted} <= {*names}:
-                    place, header = k, names
-    counted, notes = [str(k + 1) for k in range(filled)], list[str]()
-    if place < 0 < start and wanted and not {*wanted} <= {*counted} and not _is_comment(lines[start - 1][1]):
-        place, header = start - 1, lines[start - 1][1]
-    while place < 0 and start - 1 in rows:
-        start -= 1  # few numbers, but no line names the columns
-    skipped = [line for line, _ in lines[: start if place < 0 else place]]
-    if skipped:
-        notes.append(f"line {few(skipped)} before the {'rows' if place < 0 else 'header'} skipped")
-    if place < 0:
-        header, place = counted, start - 1
-        notes.append(f"no header line: columns are named by their places, 1 to {filled}")
-    while header and not header[-1]:
-        header = header[:-1]
-    below = next((line for line in lines[place + 1 :] if not _is_comment(line[1])), (0, [""]))
-    units = dict(zip(header, map(unit_of, below[1]), strict=False)) if _is_units(below[1]) else {}
-    if units:
-        notes.append(f"line {below[0]} holds units")
-    last = below[0] if units else lines[place][0] if place >= 0 else 0
-    return Head(header, last, max(width - len(header), 0), units, notes)
+        return file.header, [line for block in file.blocks(ALL) for line in block]
 
 
 def _named(lines: Lines, start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
@@ -324,16 +296,14 @@ def _joined(names: list[list[str]]) -> list[str]:
 
 def unit_of(text: str) -> str:
     """The unit that a text is, in small letters without brackets; empty if it is none."""
-    lowered = text.lower().replace("μ", "µ")
-    found = _UNIT.fullmatch(_WHOLE.get(lowered.strip("[]()<>{} "), lowered))
-    return found[1] if found else ""
+    bare = text.lower().replace("\u03bc", "µ").strip("[](){}<> ")
+    return bare if bare in (*LENGTHS, *ANGLES, *OTHERS) else ""
 
 
 def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
     """The unit of length or angle in brackets after the name of a column, or in a row of units; None without any."""
     bracket = re.search(r"[\[(][^\[(]*[\])]$", column)
-    unit = units.get(column) or (unit_of(bracket[0]) if bracket else "")
-    return (LENGTHS | ANGLES).get(unit)
+    return (LENGTHS | ANGLES).get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
 
 
 def _is_units(cells: Sequence[str]) -> bool:

@@ -16,14 +16,12 @@ from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import (
     LARGEST_NUMBER,
-    BadCells,
     Block,
     Hideable,
+    bad_cells,
     find_columns,
-    number,
     number_hint,
     numbers_in,
-    parse,
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
@@ -188,47 +186,34 @@ class TableFile(CsvLines):
             raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
-        """Numbers as written in the file, in blocks; nothing more from the first block with a mistake on.
-
-        MeasurementError for anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the
-        whole file first.
-        """
-        wanted, decimal = self.columns.names, self.columns.table.decimal
+        """Numbers as written in the file, in blocks; MeasurementError for the first block with a mistake."""
+        wanted = self.columns.names
         named = [name for name, needed in self.texts.items() if needed or name in self.header]
         places = find_columns(self.path, self.header, [*wanted, *named], self.sep)
         self._check_units()
         self._words = {}
-        unreadable, missing = BadCells(), BadCells()
-        for lines in self.blocks(ROWS_AT_ONCE):
-            cells = [[row[column] for column in places[: len(wanted)]] for _, row in lines]
-            numbers = parse(cells, decimal)
-            if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
-                numbers = self._with_gaps([line for line, _ in lines], cells, unreadable, missing)
-            if lines and not (self.ragged or unreadable.first or missing.first):
-                own = zip(named, places[len(wanted) :], strict=True)
-                found = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in lines] for name, k in own}
-                yield Block(numbers, found, [line for line, _ in lines])
-        if unreadable.first:
-            raise unreadable.error(self.path, "a number", number_hint(unreadable.first[2], decimal))
-        if missing.first:
-            large = math.isfinite(number(missing.first[2], decimal) or 0.0)
-            expected = f"a number below {LARGEST_NUMBER:g} in size" if large else "a finite number"
-            hint = " (all cells of a hidden marker or frame are empty)" * bool(self.columns.hideable)
-            raise missing.error(self.path, expected, f"remove or repair these lines{hint}")
+        for block in self.blocks(ROWS_AT_ONCE):
+            lines = [line for line, _ in block]
+            cells = [[row[column] for _, row in block] for column in places[: len(wanted)]]
+            numbers = self._with_gaps(lines, cells)
+            own = zip(named, places[len(wanted) :], strict=True)
+            texts = {name: ["" if row[k].lower() == "nan" else row[k] for _, row in block] for name, k in own}
+            yield Block(numbers, texts, lines)
 
-    def _with_gaps(
-        self, lines: Sequence[int], rows: Sequence[Sequence[str]], unreadable: BadCells, missing: BadCells
-    ) -> Tensor:
-        """Numbers of rows, NaN in the columns of hidden markers; other cells without a number are added to the bad."""
-        texts = [*zip(*rows, strict=True)]
-        found = [numbers_in(column, self.columns.table.decimal) for column in texts]
-        known = [[math.nan if value is None else value for value in column] for column in found]
-        numbers = torch.tensor(known, dtype=torch.float64, device=HOST).T.reshape(len(rows), -1)
-        bad = ~(numbers.abs() < LARGEST_NUMBER)  # NaN too
-        excused, shows = torch.zeros_like(bad), torch.zeros_like(bad[:, 0])
-        hideable = self.columns.hideable
-        kinds = numbers.isnan(), numbers.abs() >= LARGEST_NUMBER  # of one kind: others are damage
-        seen = [~torch.stack([kind[:, own.values].all(1) for kind in kinds]).any(0) for own in hideable]
+    def _with_gaps(self, lines: Sequence[int], columns: Sequence[Sequence[str]]) -> Tensor:
+        """Numbers (B, c) of columns, NaN where a marker is hidden; MeasurementError for other cells without one."""
+        names, decimal, hideable = self.columns.names, self.columns.table.decimal, self.columns.hideable
+        found = [numbers_in(column, decimal) for column in columns]
+        if any(None in column for column in found):
+            rows = zip(lines, zip(*columns, strict=True), zip(*found, strict=True), strict=True)
+            bad = [
+                (line, names[k], texts[k]) for line, texts, own in rows for k, value in enumerate(own) if value is None
+            ]
+            raise bad_cells(self.path, bad, "a number", number_hint(bad[0][2], decimal))
+        numbers = torch.tensor(found, dtype=torch.float64, device=HOST).T
+        empty, large = numbers.isnan(), numbers.abs() >= LARGEST_NUMBER
+        excused, shows = torch.zeros_like(empty), torch.zeros_like(empty[:, 0])
+        seen = [~(empty[:, own.values].all(1) | large[:, own.values].all(1)) for own in hideable]
         for own, here in zip(hideable, seen, strict=True):
             excused[:, [*own.values, *own.deviations]] |= ~here[:, None]
             shows |= here
@@ -236,15 +221,17 @@ class TableFile(CsvLines):
             excused[:, own.deviations] &= ~here[:, None]
         if hideable and not self.columns.all_hidden:
             excused[:, len(self.columns.joints) :] |= ~shows[:, None]  # the row is left out
-        for row, place in bad.nonzero().tolist():
-            line, text = lines[row], rows[row][place]
-            if found[place][row] is None:
-                unreadable.add(line, self.columns.names[place], text)
-            elif not excused[row, place]:
-                missing.add(line, self.columns.names[place], text)
-            elif text.lower() not in ("", "nan"):
-                self._words.setdefault(text, []).append(line)
-        return numbers.masked_fill(bad, math.nan)
+        gaps = empty | large
+        bad = [(lines[row], names[k], columns[k][row]) for row, k in (gaps & ~excused).nonzero().tolist()]
+        if bad:
+            hint = " (all cells of a hidden marker or frame are empty)" * bool(hideable)
+            huge = bool((large & ~numbers.isinf() & ~excused).any())
+            expected = f"a number below {LARGEST_NUMBER:g} in size" if huge else "a finite number"
+            raise bad_cells(self.path, bad, expected, f"remove or repair these lines{hint}")
+        for row, place in gaps.nonzero().tolist():
+            if columns[place][row].lower() not in ("", "nan"):
+                self._words.setdefault(columns[place][row], []).append(lines[row])
+        return numbers.masked_fill(gaps, math.nan)
 
     def _check_units(self) -> None:
         """Raise MeasurementError where the file states another unit of a wanted column than it is read with."""
@@ -267,20 +254,20 @@ class TableFile(CsvLines):
         """All blocks; what they have in common is checked after the last one."""
         columns, largest = self.columns, None
         checks = [group.check for group in columns.groups.values() for _ in group.names]
-        wrong = {place: (check, BadCells()) for place, check in enumerate(checks) if check is not None}
         unseen, self.rows = columns.hideable, 0
         for block in self._numbers():
             raw = block.numbers
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
             largest = most if largest is None else torch.maximum(largest, most)
-            for place, (check, bad) in wrong.items():
-                values = raw[:, place]
-                for row in (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist():
-                    bad.add(block.lines[row], columns.names[place], f"{float(values[row]):g}")
+            for name, check, values in zip(columns.names, checks, raw.T, strict=True):
+                wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist()
+                if check is not None and wrong:
+                    bad = [(block.lines[row], name, f"{float(values[row]):g}") for row in wrong]
+                    raise bad_cells(self.path, bad, check.expected, check.fix)
             unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
             self.rows += len(block.lines)
             yield block
-        notes = self.decided
+        notes = self.notes
         if self._words:
             words = " and ".join(f"'{shown(text)}' ({len(at)})" for text, at in self._words.items())
             at = few(sorted({line for own in self._words.values() for line in own}))
@@ -290,10 +277,7 @@ class TableFile(CsvLines):
         if largest is not None:
             for text in columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
-        for check, bad in wrong.values():
-            if bad.first:
-                raise bad.error(self.path, check.expected, check.fix)
-        for own in unseen if self.rows else ():
+        for own in unseen:
             names = few([columns.names[place] for place in own.values])
             what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
