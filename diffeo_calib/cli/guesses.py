@@ -9,7 +9,7 @@ from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, numbers_in
-from diffeo_calib.measurements.csv.lines import ALL, CsvLines
+from diffeo_calib.measurements.csv.lines import CsvLines
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -76,7 +76,7 @@ def guess_sheet(path: Path) -> Sheet:
         file = CsvLines(path, sep)
         try:
             with file:
-                rows = [cells for block in file.blocks(ALL) for _, cells in block][:ROWS_LOOKED_AT]
+                rows = [cells for block in file.blocks() for _, cells in block][:ROWS_LOOKED_AT]
         except MeasurementError as error:
             reasons.append((len(file.header), error))
             continue

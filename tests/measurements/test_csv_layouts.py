@@ -47,6 +47,11 @@ READ = {
     "Windows": (("Kraft (°), größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
     "a number sign before the names": ("# " + PLAIN, {}, ""),
     "as numpy.savetxt writes": ("# " + separated(" "), {"sep": " "}, ""),
+    "aligned columns": (
+        "".join("".join(f"{cell:>12}" for cell in row) + "\n" for row in [NAMES, *CELLS]),
+        {"sep": " "},
+        "",
+    ),
     "percent": ("%" + PLAIN, {}, ""),
     "comments": ("# cell 4\n// by hand, today\n" + PLAIN, {}, "line 1, 2 before the header skipped"),
     "a commented header above the header": ("# q1,q2,x,y,z\n" + PLAIN, {}, "line 1 before the header skipped"),
@@ -139,8 +144,12 @@ def test_two_lines_of_names_are_joined(name: str, tmp_path: Path) -> None:
     ("content", "how", "parts"),
     [
         (PLAIN.replace("x,y", "x (cm),y"), {"names": ["q1", "q2", "x (cm)", "y", "z"]}, ["'x (cm)'", "cm", "convert"]),
-        (PLAIN.replace("q1", "q1 [°]"), {"names": ["q1 [°]", *NAMES[1:]]}, ["'q1 [°]'", "expected rad", "angle='deg'"]),
-        (separated(",", [NAMES, ["rad"] * 2 + ["m"] * 3, *CELLS]), {}, ["'x'", "expected mm", "got m", "length='m'"]),
+        (PLAIN.replace("q1", "q1 [°]"), {"names": ["q1 [°]", *NAMES[1:]]}, ["'q1 [°]'", "expected rad", "got deg"]),
+        (
+            separated(",", [NAMES, ["rad"] * 2 + ["m"] * 3, *CELLS]),
+            {},
+            ["'x'", "expected mm", "got m", "state the unit"],
+        ),
         (PLAIN.replace("y,z", "x,z"), {"names": ["q1", "q2", "x", "x", "z"]}, ["'x'"]),
         (PLAIN.replace("q1,q2,x,y,z", "q1,q2,x,x,z,"), {"names": [*NAMES[:3], "z", "q3"]}, ["no column ['q3']"]),
         (PLAIN.replace("1000.50", "1,000"), {}, ["line 2", "5 cells as in the header", "got 6"]),

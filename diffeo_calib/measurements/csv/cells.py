@@ -92,18 +92,12 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
 
 def _near(missing: Sequence[str], free: Sequence[str]) -> str:
     """Which of the columns that no other name matches may be meant; "_", "joint" and case do not count."""
-    names = {_bare(name): name for name in free if len(name) <= LONGEST_NAME}
+    names = {re.sub("joint|_", "", name.lower()) or name: name for name in free if len(name) <= LONGEST_NAME}
     hints = []
     for name in [name for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME]:
-        found = [shown(names[near]) for near in difflib.get_close_matches(_bare(name), names, n=2)]
-        hints += [f"for '{shown(name)}', did you mean {' or '.join(found)}"] * bool(found)
+        near = difflib.get_close_matches(re.sub("joint|_", "", name.lower()) or name, names, n=2)
+        hints += [f"for '{shown(name)}', did you mean {' or '.join(shown(names[one]) for one in near)}"] * bool(near)
     return "; ".join(hints) if hints else "pass the names as written in the header"
-
-
-def _bare(name: str) -> str:
-    """A name as it is compared with others."""
-    lowered = name.lower()
-    return lowered.replace("joint", "").replace("_", "") or lowered
 
 
 def numbers_in(texts: Sequence[str], decimal: str) -> list[float | None]:

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
-ALL = 1 << 40
-"""Rows of a whole file."""
-AT_ONCE = 1 << 16
+AT_ONCE = 1 << 13
 """Bytes that are decoded together."""
 HEAD = 200
 """Lines among which the header is."""
@@ -49,27 +47,8 @@ BINARY = {
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
 ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
 """Units as they are written, and their names."""
-OTHERS = (
-    "s",
-    "sec",
-    "ms",
-    "us",
-    "min",
-    "h",
-    "kg",
-    "g",
-    "n",
-    "nm",
-    "°c",
-    "c",
-    "k",
-    "v",
-    "px",
-    "pixel",
-    "%",
-    "-",
-    "none",
-)
+OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
+"""Further units."""
 
 
 class CsvLines:
@@ -92,6 +71,7 @@ class CsvLines:
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
         self.path, self.sep, self._wanted = path, sep, wanted
         self.header, self.units = list[str](), dict[str, str]()
+        self._aligned = False
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._notes, self._skipped = list[str](), list[int]()
         self._stack = ExitStack()
@@ -106,8 +86,11 @@ class CsvLines:
                 file = copy
             encoding = self._encoding(file)
             file.seek(0)
-            self._file = stack.enter_context(TextIOWrapper(file, encoding, newline=""))
+            self._file = stack.enter_context(TextIOWrapper(file, encoding, "replace", newline=""))
             lines = list(islice(self._cells(), HEAD))
+            if self.sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
+                self._aligned = True
+                lines = list(islice(self._cells(), HEAD))
             if not lines:
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
@@ -131,8 +114,8 @@ class CsvLines:
         skipped = f"{len(self._skipped)} line(s) with comments or nothing skipped (line {few(self._skipped)})"
         return self._notes + [skipped] * bool(self._skipped)
 
-    def blocks(self, rows: int) -> Iterator[Lines]:
-        """The lines below the header, up to ``rows`` at once, from the first one at every call."""
+    def blocks(self, rows: int | None = None) -> Iterator[Lines]:
+        """The lines below the header, up to ``rows`` at once, or all, from the first one at every call."""
         self._skipped, count, expected = [], 0, len(self.header)
         lines = (line for line in self._cells() if line[0] > self._last)
         while block := list(islice(lines, rows)):
@@ -182,7 +165,8 @@ class CsvLines:
         """Line number and stripped cells of every line that is not blank."""
         line = 0
         self._file.seek(0)
-        reader = csv.reader(self._file, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
+        texts = (re.sub(" +", " ", text.strip(" ")) for text in self._file) if self._aligned else self._file
+        reader = csv.reader(texts, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
         try:
             with self._read():
                 for cells in reader:
@@ -198,10 +182,6 @@ class CsvLines:
     def _read(self) -> Iterator[None]:
         try:
             yield
-        except UnicodeDecodeError as error:
-            fix = "save the table as CSV with UTF-8 encoding"
-            what = f"file '{self.path}' is no text in {error.encoding}"
-            raise MeasurementError.of(what, expected="a CSV file", fix=fix) from error
         except OSError as error:
             what = f"file '{self.path}' cannot be read to its end ({error.strerror})"
             raise MeasurementError.of(what, fix="copy it to another disk first") from error
@@ -252,7 +232,7 @@ def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[s
         MeasurementError: as :class:`CsvLines`.
     """
     with CsvLines(path, sep, wanted) as file:
-        return file.header, [line for block in file.blocks(ALL) for line in block]
+        return file.header, [line for block in file.blocks() for line in block]
 
 
 def _named(lines: Lines, start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
@@ -270,7 +250,7 @@ def _named(lines: Lines, start: int, sizes: Sequence[int]) -> tuple[int, list[st
             return k, cells
     if words:
         return words[-1][0], _joined([cells for _, cells in words])
-    if before and before[-1][0] == start - 1 and len(before[-1][1]) > 1:
+    if before and before[-1][0] == start - 1 and len(before[-1][1]) > 1 and not _is_units(before[-1][1]):
         return before[-1]
     for k in reversed(range(start)):
         names = _uncommented(lines[k][1], sizes[0])
@@ -297,7 +277,7 @@ def _joined(names: list[list[str]]) -> list[str]:
 def unit_of(text: str) -> str:
     """The unit that a text is, in small letters without brackets; empty if it is none."""
     bare = text.lower().replace("\u03bc", "µ").strip("[](){}<> ")
-    return bare if bare in (*LENGTHS, *ANGLES, *OTHERS) else ""
+    return bare if bare in LENGTHS | ANGLES or OTHERS.fullmatch(bare) else ""
 
 
 def stated_unit(column: str, units: Mapping[str, str]) -> str | None:

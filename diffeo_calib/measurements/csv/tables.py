@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,8 +26,7 @@ from diffeo_calib.measurements.csv.cells import (
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
-from diffeo_calib.measurements.poses import ANGLE_UNITS, LEVER
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.poses import LEVER
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class TableOrigin:
         if not all(wanted):
             return {}
         found = {}
-        for place, name in enumerate(header):
-            values = numbers_in([row[place] for row in wanted], self.columns.table.decimal)
+        for name, texts in zip(header, zip(*wanted, strict=True), strict=True):
+            values = numbers_in(texts, self.columns.table.decimal)
             there = [value for value in values if not gaps or value is None or not math.isnan(value)]
             if there and all(value is not None and math.isfinite(value) for value in there):
                 found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
@@ -237,17 +237,13 @@ class TableFile(CsvLines):
         """Raise MeasurementError where the file states another unit of a wanted column than it is read with."""
         columns, table = self.columns, self.columns.table
         slides = zip(columns.joints, columns.prismatic.tolist(), strict=True)
-        read = {name: ("joint_length", table.joint_unit) if slide else ("angle", table.angle) for name, slide in slides}
-        for key, group in columns.groups.items():
-            option = "rotation_angle" if key == "rotation_std" else "length"
-            read |= {name: (option, group.unit) for name in group.names if isinstance(group.unit, str)}
-        for name, (option, unit) in read.items():
+        read: dict[str, Any] = {name: table.joint_unit if slide else table.angle for name, slide in slides}
+        read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
+        for name, unit in read.items():
             stated = stated_unit(name, self.units)
-            guessed = option == "angle" and not columns.kinds_known  # the joint may be prismatic
-            if stated is not None and stated != unit and not (guessed and stated not in ANGLES):
-                what = f"file '{self.path}', column '{shown(name)}'"
-                usual = stated in (*UNITS_PER_METRE, *ANGLE_UNITS)
-                fix = f"pass {option}={stated!r}, or convert" if usual else "convert the column"
+            known = columns.kinds_known or name not in columns.joints or stated in ANGLES  # else it may be prismatic
+            if isinstance(unit, str) and stated not in (None, unit) and known:
+                what, fix = f"file '{self.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
                 raise MeasurementError.of(what, expected=f"{unit}, as stated", got=f"{stated} in its header", fix=fix)
 
     def _checked(self) -> Iterator[Block]:
