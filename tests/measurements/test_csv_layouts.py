@@ -8,9 +8,11 @@ import pytest
 from table_bank import Reader, says
 from torch.testing import assert_close
 
-from diffeo_calib.cli.guesses import guess_sheet
+from diffeo_calib.cli.guesses import guess_joints, guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, read_observations
+from diffeo_calib.measurements.csv.sensors import TableColumns
+from diffeo_calib.measurements.table_format import TableFormat
 
 NAMES = ["q1", "q2", "x", "y", "z"]
 CELLS = [
@@ -201,3 +203,17 @@ def test_a_marker_at_the_origin_far_from_all_rows_was_not_seen(rows: tuple[int, 
 def test_a_marker_near_the_origin_stays(read: Reader) -> None:
     near = [[*row[:2], f"{30 * (k - 3)}", f"{(k - 3) ** 2}", "0"] for k, row in enumerate(CELLS)]
     assert len(read(separated(",", [NAMES, *near]), NAMES[:2], NAMES[2:], **FORMAT)) == 8
+
+
+def test_a_growing_table_keeps_every_row(tmp_path: Path) -> None:
+    """Rows that come one by one cannot be judged by those that come later."""
+    (tmp_path / "table.csv").write_text(lost(3))
+    columns = TableColumns(NAMES[:2], [tuple(NAMES[2:])])
+    assert len(read_observations(tmp_path / "table.csv", columns, TableFormat(**FORMAT), growing=True)) == 8
+
+
+def test_joints_without_names_are_the_first_columns() -> None:
+    assert guess_joints([*"123456789"], ["a", "b", "c"]) == (
+        [*"123"],
+        "the first columns: no line of the file names them",
+    )

@@ -139,8 +139,6 @@ def number(text: str, decimal: str, *, grouped: bool = False) -> float | None:
 def number_hint(text: str, decimal: str) -> str:
     """What to do about a cell that is no number."""
     other, word = (",", "comma") if decimal == "." else (".", "point")
-    if number(text, decimal, grouped=True) is not None:
-        return f"looks like a decimal {word}, or thousands: pass decimal={other!r}, or export without these marks"
-    if number(text, other) is not None:
-        return f"looks like a decimal {word}: pass decimal={other!r}"
+    if number(text, other) is not None or number(text, decimal, grouped=True) is not None:
+        return f"looks like a decimal {word}: pass decimal={other!r}, or export without marks of thousands"
     return "repair this cell, or name another column"

@@ -12,7 +12,6 @@ import os
 import re
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
@@ -37,12 +36,7 @@ HEAD = 200
 """Lines among which the header is."""
 COMMENTS = "#", "%", "//"
 """Marks that begin a comment."""
-BINARY = {
-    b"PK\3\4": "a spreadsheet",
-    b"\xd0\xcf\x11\xe0": "a spreadsheet",
-    b"\x93NUMPY": "an array",
-    b"MATLAB": "MATLAB",
-}
+BINARY = {b"PK\3\4": "a spreadsheet", b"\xd0\xcf\x11\xe0": "a spreadsheet", b"\x93NUMPY": "an array of numpy"}
 """First bytes of files that are no text, and what they are."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
 ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
@@ -79,7 +73,7 @@ class CsvLines:
 
     def __enter__(self) -> Self:
         with self._stack as stack, self._read():  # closed if the header cannot be read
-            file = stack.enter_context(self._open())
+            file = stack.enter_context(self.path.open("rb"))
             if not file.seekable():
                 copy = stack.enter_context(tempfile.TemporaryFile())
                 shutil.copyfileobj(file, copy)
@@ -134,14 +128,6 @@ class CsvLines:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
 
-    def _open(self) -> BinaryIO:
-        try:
-            return self.path.open("rb")
-        except OSError as error:
-            what = f"file '{self.path}' " + ("does not exist" if not self.path.exists() else "cannot be opened")
-            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-            raise MeasurementError.of(f"{what} ({error.strerror})", fix=fix) from error
-
     def _encoding(self, file: BinaryIO) -> str:
         """Of the text; MeasurementError if the file is none."""
         file.seek(0)
@@ -183,8 +169,9 @@ class CsvLines:
         try:
             yield
         except OSError as error:
-            what = f"file '{self.path}' cannot be read to its end ({error.strerror})"
-            raise MeasurementError.of(what, fix="copy it to another disk first") from error
+            what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
+            raise MeasurementError.of(f"file '{self.path}' {what}", fix=fix) from error
 
     def _find_header(self, lines: Lines) -> None:
         """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
@@ -193,8 +180,8 @@ class CsvLines:
         the last line before the rows that has them all.
         """
         counts = [0 if _is_comment(cells) else _numbers(cells) for _, cells in lines]
-        sizes = Counter(len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count)
-        width = max(sizes, key=lambda size: sizes[size], default=0)
+        sizes = [len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count]
+        width = max(sizes, key=sizes.count, default=0)
         rows = [k for k, (_, cells) in enumerate(lines) if counts[k] and len(cells) == width]
         usual = sorted(counts[k] for k in rows)[len(rows) // 2] if rows else 0
         start = next((k for k in rows if 2 * counts[k] > usual), len(lines))

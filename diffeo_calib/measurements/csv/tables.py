@@ -26,7 +26,8 @@ from diffeo_calib.measurements.csv.cells import (
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
-from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.poses import ANGLE_UNITS, LEVER
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 
 
 @dataclass(frozen=True)
@@ -239,12 +240,14 @@ class TableFile(CsvLines):
         slides = zip(columns.joints, columns.prismatic.tolist(), strict=True)
         read: dict[str, Any] = {name: table.joint_unit if slide else table.angle for name, slide in slides}
         read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
-        for name, unit in read.items():
-            stated = stated_unit(name, self.units)
-            known = columns.kinds_known or name not in columns.joints or stated in ANGLES  # else it may be prismatic
-            if isinstance(unit, str) and stated not in (None, unit) and known:
-                what, fix = f"file '{self.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
-                raise MeasurementError.of(what, expected=f"{unit}, as stated", got=f"{stated} in its header", fix=fix)
+        stated = {name: stated_unit(name, self.units) for name in read}
+        if not columns.kinds_known:  # the joints may be prismatic
+            stated |= {name: None for name in columns.joints if stated[name] not in ANGLES}
+        wrong = [name for name, unit in read.items() if isinstance(unit, str) and stated[name] not in (None, unit)]
+        for name in sorted(wrong, key=lambda name: stated[name] in (*UNITS_PER_METRE, *ANGLE_UNITS)):  # cm, inch first
+            what, fix = f"file '{self.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
+            got = f"{stated[name]} in its header"
+            raise MeasurementError.of(what, expected=f"{read[name]}, as stated", got=got, fix=fix)
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
