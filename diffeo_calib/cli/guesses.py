@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, numbers_in
+from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
 from diffeo_calib.measurements.csv.lines import CsvLines
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
@@ -59,7 +59,7 @@ class Sheet:
 
     Args:
         sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
-        notes: what the reader decided.
+        notes: what the reader decided. odd: which cells are no numbers in columns that seem to hold some; or empty.
     """
 
     sep: str
@@ -67,6 +67,7 @@ class Sheet:
     header: tuple[str, ...]
     numbers: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    odd: str = ""
 
 
 def guess_sheet(path: Path) -> Sheet:
@@ -76,15 +77,19 @@ def guess_sheet(path: Path) -> Sheet:
         file = CsvLines(path, sep)
         try:
             with file:
-                rows = [cells for block in file.blocks() for _, cells in block][:ROWS_LOOKED_AT]
+                rows = [line for block in file.blocks() for line in block][:ROWS_LOOKED_AT]
         except MeasurementError as error:
             reasons.append((len(file.header), error))
             continue
-        columns = [(name, texts) for name, *texts in zip(file.header, *rows, strict=True) if name]
+        lines, cells = zip(*rows, strict=True)
+        columns = {name: texts for name, *texts in zip(file.header, *cells, strict=True) if name}
         for decimal in (mark for mark in DECIMALS if mark != sep):
-            numbers = dict.fromkeys(name for name, texts in columns if _readable(texts, decimal))
-            names = tuple(name for name, _ in columns)
-            found.append(Sheet(sep, decimal, names, tuple(numbers), tuple(file.notes)))
+            numbers = tuple(name for name, texts in columns.items() if _readable(texts, decimal))
+            odd = [
+                cell for name in columns if name not in numbers for cell in _odd(name, lines, columns[name], decimal)
+            ]
+            why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
+            found.append(Sheet(sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
@@ -100,6 +105,14 @@ def _readable(texts: Sequence[str], decimal: str) -> bool:
     values = numbers_in(texts, decimal)
     large = [value for value in values if value is not None and abs(value) >= LARGEST_NUMBER]  # not NaN
     return None not in values and 2 * len(large) <= len(values)
+
+
+def _odd(name: str, lines: Sequence[int], texts: Sequence[str], decimal: str) -> list[tuple[int, str, str]]:
+    """Line, column and text of the cells that are no numbers, if most are, or if they look like numbers."""
+    values = numbers_in(texts, decimal)
+    found = [(line, name, text) for line, text, value in zip(lines, texts, values, strict=True) if value is None]
+    seem = bool(found) and number(found[0][2], decimal, grouped=True) is not None
+    return found if seem or 2 * len(found) < len(texts) else []
 
 
 def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:

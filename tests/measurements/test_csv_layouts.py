@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from table_bank import Reader, says
@@ -20,7 +21,7 @@ CELLS = [
 ]
 PLAIN = "".join(",".join(row) + "\n" for row in [NAMES, *CELLS])
 ROWS = PLAIN.partition("\n")[2]
-FORMAT = {"length": "mm", "angle": "rad"}
+FORMAT: dict[str, Any] = {"length": "mm", "angle": "rad"}
 
 
 def numbers(read: Reader, content: str | bytes, names: list[str] = NAMES, **how: str) -> list[list[float]]:
@@ -68,9 +69,9 @@ READ = {
     "comments between rows": (
         PLAIN.replace("0.200,", "# moved the tripod\n0.200,") + "#9,9,9,9,9\n",
         {},
-        "2 line(s) with comments or nothing skipped (line 4, 11)",
+        "2 line(s) with comments, names or nothing skipped (line 4, 11)",
     ),
-    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments or nothing skipped"),
+    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names or nothing skipped"),
     "trailing separators": (PLAIN.replace("\n", ",\n"), {}, ""),
     "trailing separators of rows alone": (
         PLAIN.replace("\n", ";\n").replace("z;", "z").replace(",", ";"),
@@ -88,6 +89,16 @@ READ = {
         separated(",", [["", *NAMES], *([str(k), *row] for k, row in enumerate(CELLS))]),
         {},
         "",
+    ),
+    "labels that begin as comments do": (
+        separated(",", [["pose", *NAMES], *([f"#{k}", *row] for k, row in enumerate(CELLS))]),
+        {},
+        "",
+    ),
+    "names again between the rows": (
+        PLAIN + PLAIN,
+        {"duplicates": "drop"},
+        "with comments, names or nothing skipped (line 10)",
     ),
     "another name twice": (separated(",", [[*NAMES, "t", "t"], *([*row, "1", "2"] for row in CELLS)]), {}, ""),
 }
@@ -166,7 +177,9 @@ def test_two_lines_of_names_are_joined(name: str, tmp_path: Path) -> None:
         (b"\x93NUMPY" + b"\xff" * 40, {}, ["an array"]),
     ],
 )
-def test_what_is_mistakable_is_an_error(content: str | bytes, how: dict, parts: list[str], read: Reader) -> None:
+def test_what_is_mistakable_is_an_error(
+    content: str | bytes, how: dict[str, Any], parts: list[str], read: Reader
+) -> None:
     with pytest.raises(MeasurementError, match=says(*parts)):
         numbers(read, content, **how)
 
@@ -217,3 +230,10 @@ def test_joints_without_names_are_the_first_columns() -> None:
         [*"123"],
         "the first columns: no line of the file names them",
     )
+
+
+def test_a_cell_that_hides_a_column_from_the_proposal_is_named(tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text(separated(";", [NAMES, *CELLS]).replace("1002.50", "1002,50"))
+    sheet = guess_sheet(tmp_path / "table.csv")
+    assert "x" not in sheet.numbers
+    assert "line 4, column 'x': expected a number, got '1002,50'; looks like a decimal comma" in sheet.odd

@@ -65,7 +65,7 @@ class CsvLines:
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
         self.path, self.sep, self._wanted = path, sep, wanted
         self.header, self.units = list[str](), dict[str, str]()
-        self._aligned = False
+        self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._notes, self._skipped = list[str](), list[int]()
         self._stack = ExitStack()
@@ -105,7 +105,7 @@ class CsvLines:
     @property
     def notes(self) -> list[str]:
         """What was decided, in words; after a pass through the rows also which lines between them were skipped."""
-        skipped = f"{len(self._skipped)} line(s) with comments or nothing skipped (line {few(self._skipped)})"
+        skipped = f"{len(self._skipped)} line(s) with comments, names or nothing skipped (line {few(self._skipped)})"
         return self._notes + [skipped] * bool(self._skipped)
 
     def blocks(self, rows: int | None = None) -> Iterator[Lines]:
@@ -113,7 +113,7 @@ class CsvLines:
         self._skipped, count, expected = [], 0, len(self.header)
         lines = (line for line in self._cells() if line[0] > self._last)
         while block := list(islice(lines, rows)):
-            kept = [(line, cells) for line, cells in block if any(cells) and not _is_comment(cells)]
+            kept = [(line, cells) for line, cells in block if not self._no_row(cells)]
             self._skipped += sorted({line for line, _ in block} - {line for line, _ in kept})
             sizes = expected, expected + self._extra
             bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
@@ -173,26 +173,34 @@ class CsvLines:
             fix = f"check the name and the folder (searched from '{Path.cwd()}')"
             raise MeasurementError.of(f"file '{self.path}' {what}", fix=fix) from error
 
+    def _no_row(self, cells: Sequence[str]) -> bool:
+        """Whether a line below the header is a comment, empty, or the header again."""
+        return not any(cells) or cells[: len(self.header)] == self.header or (self._commented and _is_comment(cells))
+
     def _find_header(self, lines: Lines) -> None:
         """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
 
         It is the first line with a name for every cell of the rows, or two lines together; if it lacks a wanted name,
         the last line before the rows that has them all.
         """
-        counts = [0 if _is_comment(cells) else _numbers(cells) for _, cells in lines]
+        counts = [_numbers(cells) for _, cells in lines]
+        comments = [_is_comment(cells) for _, cells in lines]
+        if 2 * sum(count > 0 for count, comment in zip(counts, comments, strict=True) if comment) > len(lines):
+            self._commented, comments = False, [False] * len(lines)  # rows whose first cell is such as "#12"
+        counts = [0 if comment else count for count, comment in zip(counts, comments, strict=True)]
         sizes = [len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count]
         width = max(sizes, key=sizes.count, default=0)
         rows = [k for k, (_, cells) in enumerate(lines) if counts[k] and len(cells) == width]
         usual = sorted(counts[k] for k in rows)[len(rows) // 2] if rows else 0
         start = next((k for k in rows if 2 * counts[k] > usual), len(lines))
         filled = max((place + 1 for k in rows for place, cell in enumerate(lines[k][1]) if cell), default=0)
-        place, header = _named(lines, start, range(filled, width + 1))
+        place, header = _named(lines, comments, start, range(filled, width + 1))
         wanted, counted = {*self._wanted}, [str(k + 1) for k in range(filled)]
         for k, (_, cells) in enumerate(lines[: max(start, 1)] if not wanted <= {*header} else []):
             for names in (cells, _uncommented(cells, width)):
                 if wanted <= {*names}:
                     place, header = k, names
-        if place < 0 < start and not wanted <= {*counted} and not _is_comment(lines[start - 1][1]):
+        if place < 0 < start and not wanted <= {*counted} and not comments[start - 1]:
             place, header = start - 1, lines[start - 1][1]
         while place < 0 and start - 1 in rows:
             start -= 1  # few numbers, but no line names the columns
@@ -204,7 +212,7 @@ class CsvLines:
             self._notes.append(f"no header line: columns are named by their places, 1 to {filled}")
         while header and not header[-1]:
             header = header[:-1]
-        below = next((line for line in lines[place + 1 :] if not _is_comment(line[1])), (0, [""]))
+        below = next((lines[k] for k in range(place + 1, len(lines)) if not comments[k]), (0, [""]))
         self._last = lines[place][0] if place >= 0 else 0
         if _is_units(below[1]):
             self._notes.append(f"line {below[0]} holds units")
@@ -222,9 +230,9 @@ def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[s
         return file.header, [line for block in file.blocks() for line in block]
 
 
-def _named(lines: Lines, start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
+def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
     """Place and cells of the line that names the columns of the rows from ``start`` on; -1 if none does."""
-    before = [(k, cells) for k, (_, cells) in enumerate(lines[:start]) if not _is_comment(cells)]
+    before = [(k, cells) for k, (_, cells) in enumerate(lines[:start]) if not comments[k]]
     if start == len(lines):
         return before[0] if before else (0, _uncommented(lines[0][1], 0))
     words = [

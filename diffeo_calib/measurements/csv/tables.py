@@ -223,15 +223,17 @@ class TableFile(CsvLines):
         if hideable and not self.columns.all_hidden:
             excused[:, len(self.columns.joints) :] |= ~shows[:, None]  # the row is left out
         gaps = empty | large
-        bad = [(lines[row], names[k], columns[k][row]) for row, k in (gaps & ~excused).nonzero().tolist()]
-        if bad:
+        wrong: list[tuple[int, int]] = (gaps & ~excused).nonzero().tolist()
+        if wrong:
+            bad = [(lines[row], names[k], columns[k][row]) for row, k in wrong]
             hint = " (all cells of a hidden marker or frame are empty)" * bool(hideable)
             huge = bool((large & ~numbers.isinf() & ~excused).any())
             expected = f"a number below {LARGEST_NUMBER:g} in size" if huge else "a finite number"
             raise bad_cells(self.path, bad, expected, f"remove or repair these lines{hint}")
-        for row, place in gaps.nonzero().tolist():
-            if columns[place][row].lower() not in ("", "nan"):
-                self._words.setdefault(columns[place][row], []).append(lines[row])
+        hidden: list[tuple[int, int]] = gaps.nonzero().tolist()
+        for row, k in hidden:
+            if columns[k][row].lower() not in ("", "nan"):
+                self._words.setdefault(columns[k][row], []).append(lines[row])
         return numbers.masked_fill(gaps, math.nan)
 
     def _check_units(self) -> None:
