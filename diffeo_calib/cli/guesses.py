@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, number, read_cells
+from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
+from diffeo_calib.measurements.csv.lines import CsvLines
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -58,41 +59,60 @@ class Sheet:
 
     Args:
         sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
-        rows: how many rows were looked at.
+        notes: what the reader decided. odd: which cells are no numbers in columns that seem to hold some; or empty.
     """
 
     sep: str
     decimal: str
     header: tuple[str, ...]
     numbers: tuple[str, ...]
-    rows: int
+    notes: tuple[str, ...] = ()
+    odd: str = ""
 
 
 def guess_sheet(path: Path) -> Sheet:
-    """The separator and decimal mark with which most columns are numbers."""
-    found: list[Sheet] = []
+    """The separator and decimal mark with which most columns are numbers; MeasurementError says why none is right."""
+    found, reasons = list[Sheet](), list[tuple[int, MeasurementError]]()
     for sep in SEPARATORS:
+        file = CsvLines(path, sep)
         try:
-            header, lines = read_cells(path, sep)
-        except MeasurementError:
+            with file:
+                rows = [line for block in file.blocks() for line in block][:ROWS_LOOKED_AT]
+        except MeasurementError as error:
+            reasons.append((len(file.header), error))
             continue
-        rows = [cells for _, cells in lines[:ROWS_LOOKED_AT]]
-        for decimal in DECIMALS:
-            if decimal == sep:
-                continue
-            columns = [k for k in range(len(header)) if all(_readable(row[k], decimal) for row in rows)]
-            found.append(Sheet(sep, decimal, tuple(header), tuple(header[k] for k in columns), len(rows)))
+        lines, cells = zip(*rows, strict=True)
+        columns = {name: texts for name, *texts in zip(file.header, *cells, strict=True) if name}
+        for decimal in (mark for mark in DECIMALS if mark != sep):
+            numbers = tuple(name for name, texts in columns.items() if _readable(texts, decimal))
+            odd = [
+                cell for name in columns if name not in numbers for cell in _odd(name, lines, columns[name], decimal)
+            ]
+            why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
+            found.append(Sheet(sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
+    width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
+    if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
+        raise reason
     if best is None or not best.numbers:
-        fix = "check that the file has one header line, and the same number of cells in every line"
+        fix = "check that one line names the columns, and that the lines below hold numbers"
         raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
     return best
 
 
-def _readable(text: str, decimal: str) -> bool:
-    """Whether `fit` reads the cell: a number, or empty. A date written as one number, 20210313..., is too large."""
-    value = number(text, decimal)
-    return value is not None and not abs(value) >= LARGEST_NUMBER  # NaN: empty
+def _readable(texts: Sequence[str], decimal: str) -> bool:
+    """Whether `fit` reads the cells: numbers, or marks of lost ones; dates such as 20210313... are all too large."""
+    values = numbers_in(texts, decimal)
+    large = [value for value in values if value is not None and abs(value) >= LARGEST_NUMBER]  # not NaN
+    return None not in values and 2 * len(large) <= len(values)
+
+
+def _odd(name: str, lines: Sequence[int], texts: Sequence[str], decimal: str) -> list[tuple[int, str, str]]:
+    """Line, column and text of the cells that are no numbers, if most are, or if they look like numbers."""
+    values = numbers_in(texts, decimal)
+    found = [(line, name, text) for line, text, value in zip(lines, texts, values, strict=True) if value is None]
+    seem = bool(found) and number(found[0][2], decimal, grouped=True) is not None
+    return found if seem or 2 * len(found) < len(texts) else []
 
 
 def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
@@ -100,6 +120,8 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[st
 
     Names are compared as they are, without case, units and signs, and then as numbered series such as q1, q2, ...
     """
+    if columns and all(column.isdecimal() for column in columns) and len(columns) > len(joints):
+        return [*columns[: len(joints)]], "the first columns: no line of the file names them"
     for how, plain in (("named as in the URDF", str), ("named as in the URDF but for units and case", _bare)):
         known = {plain(column): column for column in columns}
         if len(known) == len(columns) and all(plain(joint) in known for joint in joints):

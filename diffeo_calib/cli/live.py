@@ -275,7 +275,7 @@ class Live:
             path = Path(folder) / self.source.csv.name
             path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
             try:
-                data = replace(self.source, csv=path).read(self.campaign.robot, self.tips)
+                data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
             except DiffeoCalibError as error:
                 raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
         return data.rows(data.lines.argsort(stable=True))

@@ -36,9 +36,10 @@ from diffeo_calib.cli.guesses import (
 from diffeo_calib.cli.options import CORNERS, Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
-from diffeo_calib.measurements.csv.cells import number, read_cells
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.poses import numbers_of
@@ -138,6 +139,8 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
     markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
     others = [name for name in sheet.numbers if name not in joints]
+    if all(name.isdecimal() for name in sheet.header) and len(others) > 2:
+        markers = [others[:3]]  # no line names them
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
@@ -262,7 +265,8 @@ class Source:
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
         what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
         what = what if self.rows.without_length else "median residual of the nominal robot"
-        return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
+        than = "the table contradicts other units" if others == inf else f"in other units at least {self.size(others)}"
+        return f"{what} {self.size(best)}, {than}"
 
 
 def _in_sockets(robot: Tree, data: Measurements) -> float:

@@ -24,9 +24,9 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
-from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -198,6 +198,7 @@ class MeasuredTable:
         session: column that names the set-up of every row; None if there was one.
         sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
         readings: columns of each kind of reading, beside positions and sockets if these are named.
+        growing: whether rows will be added.
     """
 
     csv: Path
@@ -208,6 +209,7 @@ class MeasuredTable:
     session: str | None = None
     sockets: SocketColumns | None = None
     readings: tuple[Any, ...] = ()
+    growing: bool = False
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """Read the rows of a robot, under the names of its own joints.
@@ -226,7 +228,7 @@ class MeasuredTable:
         kinds, names = robot.kinds, joint_columns(self.joints, robot)
         session = self.session if triples or not self.readings else None  # of readings it names their devices
         columns = TableColumns(names, triples, self.sockets, self.readings, session, kinds)
-        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
+        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates, growing=self.growing)
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 

@@ -142,7 +142,7 @@ def test_missing_table(small_site: Site, command: Command, tmp_path: Path) -> No
     assert "nowhere.csv" in done.error
     done = command(*small_site.fit(tmp_path, tmp_path / "model"))
     assert done.code == 1
-    assert "cannot be opened" in done.error
+    assert "cannot be read" in done.error
 
 
 def test_brackets_in_names_are_shown(small_site: Site, command: Command, tmp_path: Path) -> None:

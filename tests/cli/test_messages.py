@@ -63,7 +63,7 @@ def test_escape_sequences_of_a_file_do_not_reach_the_terminal(
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
 def test_a_device_without_line_ends(small_site: Site, command: Command, tmp_path: Path) -> None:
     zero, model = Path("/dev/zero"), tmp_path / "model"
-    assert "line 1 has more than" in command(*small_site.fit(zero, model)).error
+    assert "no text but binary" in command(*small_site.fit(zero, model)).error
     assert "is no file" in command(*small_site.fit(small_site.csv, model, "--robot", zero)).error
     assert "there is no model file /dev/zero" in command("evaluate", zero, small_site.csv, *TABLE).error
 

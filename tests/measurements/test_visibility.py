@@ -110,7 +110,7 @@ def test_mistakes_in_arrays_are_named() -> None:
 # --- files --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("blank", ["", "nan", "n/a", "NULL", " "])
+@pytest.mark.parametrize("blank", ["", "nan", " "])
 def test_empty_cells_of_a_marker_are_a_hidden_marker(read: Reader, blank: str) -> None:
     rows = [row.replace(",,,", f",{blank},{blank},{blank}") for row in ROWS[:2]]
     data = read(text(*rows, f"0.5,0.6,{blank},{blank},{blank},4.5,5.5,6.5"), position=TWO)
@@ -141,11 +141,14 @@ def test_half_a_marker_is_a_mistake(read: Reader, row: str, column: str) -> None
         read(text(*ROWS, row), position=TWO)
 
 
-def test_line_without_any_marker_is_a_mistake(read: Reader) -> None:
-    with pytest.raises(MeasurementError, match=says("line 5", "every line shows some")):
-        read(text(*ROWS, "0.7,0.8,,,,,,"), position=TWO)
-    with pytest.raises(MeasurementError, match=says("line 3", "'ax'", "a finite number")):
-        read(text("0.1,0.2,1,2,3,4,5,6", "0.3,0.4,,,,4,5,6"), position=TWO[0])  # of a single marker
+def test_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 5: 1 row"):
+        assert read(text(*ROWS, "0.7,0.8,,,,,,"), position=TWO).visible.tolist() == SEEN
+    with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 3"):
+        data = read(text("0.1,0.2,1,2,3,4,5,6", "0.3,0.4,,,,4,5,6"), position=TWO[0])  # of a single marker
+    assert data.lines.tolist() == [2]
+    with pytest.raises(MeasurementError, match=says("line 5", "'q2'", "a finite number")):
+        read(text(*ROWS, "0.7,,,,,,,"), position=TWO)
 
 
 def test_marker_that_no_line_shows_is_a_mistake(read: Reader) -> None:
@@ -153,10 +156,19 @@ def test_marker_that_no_line_shows_is_a_mistake(read: Reader) -> None:
         read(text("0.1,0.2,1,2,3,,,", "0.3,0.4,1,2,3,,,"), position=TWO)
 
 
-@pytest.mark.parametrize("cell", ["inf", "1e13", "-", "hidden"])
-def test_other_marks_are_no_hidden_markers(read: Reader, cell: str) -> None:
-    with pytest.raises(MeasurementError, match=says("line 3", "'bx'", cell)):
-        read(text(ROWS[0], f"0.3,0.4,1,2,3,{cell},{cell},{cell}"), position=TWO)
+@pytest.mark.parametrize(
+    "cell", ["inf", "1e13", "-3.697314E+28", "-", "----", "hidden", "MISSING", "#N/A", "n/a", "NULL"]
+)
+def test_usual_marks_of_a_lost_marker_hide_it(read: Reader, cell: str) -> None:
+    with pytest.warns(DiffeoCalibWarning, match=says(f"'{cell}' (3)", "line 3")):
+        data = read(text(*ROWS).replace(",,,\n", f",{cell},{cell},{cell}\n", 1), position=TWO)
+    assert data.visible.tolist() == SEEN
+
+
+@pytest.mark.parametrize("cell", ["far", "1e13", "MISSING"])
+def test_no_mark_fills_the_cell_of_a_joint(read: Reader, cell: str) -> None:
+    with pytest.raises(MeasurementError, match=says("line 5", "'q2'", cell)):
+        read(text(*ROWS, f"0.7,{cell},1,2,3,4,5,6"), position=TWO)
 
 
 @pytest.mark.parametrize(("cells", "column"), [(",inf,", "by"), (",,1e400", "bz"), (",nan,5", "by"), ("inf,,", "bx")])

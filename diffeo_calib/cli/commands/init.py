@@ -31,7 +31,10 @@ def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     csv, output = given.csv, given.output
     sheet = guess_sheet(csv)
-    choices = list(_choices(csv, given.urdf, output, sheet))
+    try:
+        choices = list(_choices(csv, given.urdf, output, sheet))
+    except InputError as error:
+        raise type(error)(f"{error} {sheet.odd}".strip()) from error
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -50,7 +53,7 @@ def run(given: InitOptions) -> None:
 
 def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
     folder = output.parent
-    yield Choice("csv", relpath(csv, folder), "the table")
+    yield Choice("csv", relpath(csv, folder), "; ".join(["the table", *sheet.notes]))
     yield Choice("robot", relpath(urdf, folder), "the URDF")
     base, tip, (joints, how), why = _chain(urdf, sheet)
     rows = proposals.rows_in(csv, sheet, joints)

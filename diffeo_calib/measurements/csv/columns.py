@@ -190,7 +190,7 @@ class Columns:
             for k, triple in enumerate(self.triples)
         ]
         if not self.all_hidden:
-            return markers if count > 1 else []
+            return markers
         pairs = [(one.values.names or one.std.names, one.values.names and one.std.names, one) for one in self.readings]
         shown = [Hideable(places(*names), places(*std), f"holds {one.word}") for names, std, one in pairs if names]
         return markers + shown

@@ -38,7 +38,12 @@ Rows = TypeVar("Rows", bound=RowGroups)
 
 @outside_inference_mode
 def read_observations(
-    path: str | PathLike[str], columns: TableColumns, table: TableFormat, *, duplicates: str = "error"
+    path: str | PathLike[str],
+    columns: TableColumns,
+    table: TableFormat,
+    *,
+    duplicates: str = "error",
+    growing: bool = False,
 ) -> Any:
     """Read a table whose rows may be of several kinds; units and errors are those of :func:`read_measurements`.
 
@@ -47,7 +52,8 @@ def read_observations(
 
     Args:
         path: the file. columns: its columns. table: units, separator and decimal mark, columns of rotations, deviations
-            and payloads. duplicates: "error", "keep" or "drop".
+            and payloads. duplicates: "error", "keep" or "drop". growing: whether rows will be added, so that none may
+            be judged by the others.
 
     Returns:
         :class:`Measurements` of positions, poses, sockets, or positions and sockets; :class:`Readings` of one kind;
@@ -56,7 +62,7 @@ def read_observations(
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file, sensors, numbers = Path(path), columns.sensors, columns.numeric(table)
     with TableFile(file, numbers, columns.texts) as whole:
-        rows = FileRows(file, numbers, *whole.read(), alone=len(sensors) == 1)
+        rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
@@ -137,10 +143,12 @@ def read_measurements(
     distances: Distances | None = None,
     distance_std: float | None = None,
 ) -> Measurements:
-    """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
+    """Read a table of measurements from a CSV file and convert it to SI.
 
-    Only the named columns are read as numbers; other columns may hold anything. Blank lines are skipped. With several
-    markers, the cells x, y and z of a marker are all empty where it was hidden; with several frames all of a frame's.
+    Only the named columns are read as numbers; other columns may hold anything. Blank lines, comments (#, %, //), lines
+    before the header and a row of units below it are skipped; without a header columns are named "1", "2", ... The
+    cells x, y and z of a marker, or all of a frame, are empty where it was hidden, or hold a word such as MISSING, a
+    number beyond 1e12, or 0, 0, 0 far from all other rows. Rows without any marker are left out.
 
     Args:
         path: the file.
@@ -190,7 +198,7 @@ def read_measurements(
             named); numbers that do not form a rotation, standard deviations that are not positive.
 
     Warns:
-        DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
+        DiffeoCalibWarning: values that look as if they were in another unit; rows dropped; what was skipped.
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
@@ -241,7 +249,7 @@ def read_readings(
     offset_std: float = 0.0,
     intrinsics: tuple[float, float, float, float] | None = None,
 ) -> Readings:
-    """Read a table of distances, heights or places in images from a CSV file (UTF-8, one header line), in SI.
+    """Read a table of distances, heights or places in images from a CSV file, in SI.
 
     Args:
         path, robot, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.csv.cells import BadCells
+from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import Group, Reported
 from diffeo_calib.measurements.csv.sensors import FileRows, SensorColumns, Written
 from diffeo_calib.measurements.images import Known
@@ -62,11 +62,10 @@ class ImageColumns(SensorColumns):
         _check_joints(rows, images)
         points, pixels = (rows.values[one.values] for one in self.reported(rows.columns.table))
         flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
-        bad = BadCells()
-        for row, k in flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist():
-            bad.add(rows.lines[row], (*POINT, *PIXEL)[k], "")
-        if bad.count:
-            raise bad.error(rows.path, "a number", "fill it in, or delete the line")
+        empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
+        if empty:
+            bad = [(rows.lines[row], (*POINT, *PIXEL)[k], "") for row, k in empty]
+            raise bad_cells(rows.path, bad, "a number", "fill it in, or delete the line")
         corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
         for number, own in enumerate(images.values()):
             corners[number, : len(own)] = flat[own]

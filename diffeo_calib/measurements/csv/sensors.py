@@ -13,7 +13,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
-from diffeo_calib.measurements.csv.cells import BadCells
+from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import (
     DEVIATION,
     Check,
@@ -70,11 +70,9 @@ class FileRows(NamedTuple):
 
     def named(self, column: str, expected: str, fix: str = "fill it in") -> Sequence[str]:
         """The texts of a column; MeasurementError for empty ones, which says what is expected and what to do."""
-        bad = BadCells()
-        for line in (line for line, text in zip(self.lines, self.texts[column], strict=True) if not text):
-            bad.add(line, column, "")
-        if bad.count:
-            raise bad.error(self.path, expected, fix)
+        empty = [line for line, text in zip(self.lines, self.texts[column], strict=True) if not text]
+        if empty:
+            raise bad_cells(self.path, [(line, column, "") for line in empty], expected, fix)
         return self.texts[column]
 
     def devices(self, column: str | None, expected: str, fix: str = "fill it in") -> Sequence[str] | None:

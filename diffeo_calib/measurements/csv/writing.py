@@ -17,9 +17,10 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile, write_whole
-from diffeo_calib.measurements.csv.cells import read_cells, repeated
+from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Group, check_count, position_triples
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers

@@ -1,0 +1,310 @@
+"""Lines of a table in a text file, in blocks: its encoding, its header, and what is no row.
+
+What is unmistakable is read and noted: lines before the header, comments, a row of units, no header at all. Neither
+units nor robots are known here.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from io import TextIOWrapper
+from itertools import combinations, islice
+from math import isnan
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, BinaryIO
+
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.measurements.csv.cells import number, repeated
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Lines = list[tuple[int, list[str]]]
+"""Line number in the file and cells of every line that is not blank."""
+
+AT_ONCE = 1 << 13
+"""Bytes that are decoded together."""
+HEAD = 200
+"""Lines among which the header is."""
+COMMENTS = "#", "%", "//"
+"""Marks that begin a comment."""
+BINARY = {b"PK\3\4": "a spreadsheet", b"\xd0\xcf\x11\xe0": "a spreadsheet", b"\x93NUMPY": "an array of numpy"}
+"""First bytes of files that are no text, and what they are."""
+LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
+ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
+"""Units as they are written, and their names."""
+OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
+"""Further units."""
+
+
+class CsvLines:
+    """A table in a text file, used as a context; blank lines are skipped.
+
+    Args:
+        path: the file. What can be read only once, such as a pipe, is copied first.
+        sep: one character between cells.
+        wanted: names of columns, by which the header is known.
+
+    Attributes:
+        header: the names of the columns; by position, "1", "2", ..., where no line names them.
+        units: by name of column, of a row of units below the header.
+
+    Raises:
+        MeasurementError: a file that cannot be opened or read, is no text or no valid CSV, has no row, or lines of
+            different lengths; on entering or while it is read.
+    """
+
+    def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
+        self.path, self.sep, self._wanted = path, sep, wanted
+        self.header, self.units = list[str](), dict[str, str]()
+        self._aligned, self._commented = False, True
+        self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
+        self._notes, self._skipped = list[str](), list[int]()
+        self._stack = ExitStack()
+        self._file: TextIOWrapper
+
+    def __enter__(self) -> Self:
+        with self._stack as stack, self._read():  # closed if the header cannot be read
+            file = stack.enter_context(self.path.open("rb"))
+            if not file.seekable():
+                copy = stack.enter_context(tempfile.TemporaryFile())
+                shutil.copyfileobj(file, copy)
+                file = copy
+            encoding = self._encoding(file)
+            file.seek(0)
+            self._file = stack.enter_context(TextIOWrapper(file, encoding, "replace", newline=""))
+            lines = list(islice(self._cells(), HEAD))
+            if self.sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
+                self._aligned = True
+                lines = list(islice(self._cells(), HEAD))
+            if not lines:
+                what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
+                raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
+            self._notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig")
+            self._find_header(lines)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _value: object, _trace: TracebackType | None) -> None:
+        self._stack.close()
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the file that has been read."""
+        size = os.fstat(self._file.fileno()).st_size
+        return min(self._file.buffer.tell() / size, 1.0) if size else 0.0
+
+    @property
+    def notes(self) -> list[str]:
+        """What was decided, in words; after a pass through the rows also which lines between them were skipped."""
+        skipped = f"{len(self._skipped)} line(s) with comments, names or nothing skipped (line {few(self._skipped)})"
+        return self._notes + [skipped] * bool(self._skipped)
+
+    def blocks(self, rows: int | None = None) -> Iterator[Lines]:
+        """The lines below the header, up to ``rows`` at once, or all, from the first one at every call."""
+        self._skipped, count, expected = [], 0, len(self.header)
+        lines = (line for line in self._cells() if line[0] > self._last)
+        while block := list(islice(lines, rows)):
+            kept = [(line, cells) for line, cells in block if not self._no_row(cells)]
+            self._skipped += sorted({line for line, _ in block} - {line for line, _ in kept})
+            sizes = expected, expected + self._extra
+            bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
+            if bad:
+                what = f"file '{self.path}', line {few([line for line, _ in bad])}"
+                fix = "repair these lines (a cell that holds the separator must be quoted)"
+                raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
+            count += len(kept)
+            if kept:
+                yield [(line, cells[:expected]) for line, cells in kept]
+        if not count:
+            what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
+            raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
+
+    def _encoding(self, file: BinaryIO) -> str:
+        """Of the text; MeasurementError if the file is none."""
+        file.seek(0)
+        part, decoder = file.read(AT_ONCE), codecs.getincrementaldecoder("utf-8")()
+        if part.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return "utf-16"
+        kind, encoding = next((name for first, name in BINARY.items() if part.startswith(first)), None), "utf-8-sig"
+        while kind is None and part:
+            kind = "binary" if b"\0" in part else None
+            try:
+                decoder.decode(part, final=len(part) < AT_ONCE)
+            except UnicodeDecodeError:
+                encoding = "cp1252"
+            part = file.read(AT_ONCE)
+        if kind is not None:
+            what, fix = f"file '{self.path}' is no text but {kind}", "export the table as CSV"
+            raise MeasurementError.of(what, expected="a CSV file", fix=fix)
+        return encoding
+
+    def _cells(self) -> Iterator[tuple[int, list[str]]]:
+        """Line number and stripped cells of every line that is not blank."""
+        line = 0
+        self._file.seek(0)
+        texts = (re.sub(" +", " ", text.strip(" ")) for text in self._file) if self._aligned else self._file
+        reader = csv.reader(texts, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
+        try:
+            with self._read():
+                for cells in reader:
+                    first, line = line + 1, reader.line_num  # a quoted cell may span lines
+                    stripped = [cell.strip() for cell in cells]
+                    if len(stripped) > 1 or any(stripped):
+                        yield first, stripped
+        except csv.Error as error:
+            what = f"file '{self.path}', line {line + 1}: not valid CSV ({error})"
+            raise MeasurementError.of(what, fix="repair the quotes of this line") from error
+
+    @contextmanager
+    def _read(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
+            raise MeasurementError.of(f"file '{self.path}' {what}", fix=fix) from error
+
+    def _no_row(self, cells: Sequence[str]) -> bool:
+        """Whether a line below the header is a comment, empty, or the header again."""
+        return not any(cells) or cells[: len(self.header)] == self.header or (self._commented and _is_comment(cells))
+
+    def _find_header(self, lines: Lines) -> None:
+        """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
+
+        It is the first line with a name for every cell of the rows, or two lines together; if it lacks a wanted name,
+        the last line before the rows that has them all.
+        """
+        counts = [_numbers(cells) for _, cells in lines]
+        comments = [_is_comment(cells) for _, cells in lines]
+        if 2 * sum(count > 0 for count, comment in zip(counts, comments, strict=True) if comment) > len(lines):
+            self._commented, comments = False, [False] * len(lines)  # rows whose first cell is such as "#12"
+        counts = [0 if comment else count for count, comment in zip(counts, comments, strict=True)]
+        sizes = [len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count]
+        width = max(sizes, key=sizes.count, default=0)
+        rows = [k for k, (_, cells) in enumerate(lines) if counts[k] and len(cells) == width]
+        usual = sorted(counts[k] for k in rows)[len(rows) // 2] if rows else 0
+        start = next((k for k in rows if 2 * counts[k] > usual), len(lines))
+        filled = max((place + 1 for k in rows for place, cell in enumerate(lines[k][1]) if cell), default=0)
+        place, header = _named(lines, comments, start, range(filled, width + 1))
+        wanted, counted = {*self._wanted}, [str(k + 1) for k in range(filled)]
+        for k, (_, cells) in enumerate(lines[: max(start, 1)] if not wanted <= {*header} else []):
+            for names in (cells, _uncommented(cells, width)):
+                if wanted <= {*names}:
+                    place, header = k, names
+        if place < 0 < start and not wanted <= {*counted} and not comments[start - 1]:
+            place, header = start - 1, lines[start - 1][1]
+        while place < 0 and start - 1 in rows:
+            start -= 1  # few numbers, but no line names the columns
+        skipped = [line for line, _ in lines[: start if place < 0 else place]]
+        if skipped:
+            self._notes.append(f"line {few(skipped)} before the {'rows' if place < 0 else 'header'} skipped")
+        if place < 0:
+            header, place = counted, start - 1
+            self._notes.append(f"no header line: columns are named by their places, 1 to {filled}")
+        while header and not header[-1]:
+            header = header[:-1]
+        below = next((lines[k] for k in range(place + 1, len(lines)) if not comments[k]), (0, [""]))
+        self._last = lines[place][0] if place >= 0 else 0
+        if _is_units(below[1]):
+            self._notes.append(f"line {below[0]} holds units")
+            self._last, self.units = below[0], dict(zip(header, map(unit_of, below[1]), strict=False))
+        self.header, self._extra = header, max(width - len(header), 0)
+
+
+def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[str], Lines]:
+    """Read a table as text: the header, and number and cells of every row.
+
+    Raises:
+        MeasurementError: as :class:`CsvLines`.
+    """
+    with CsvLines(path, sep, wanted) as file:
+        return file.header, [line for block in file.blocks() for line in block]
+
+
+def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
+    """Place and cells of the line that names the columns of the rows from ``start`` on; -1 if none does."""
+    before = [(k, cells) for k, (_, cells) in enumerate(lines[:start]) if not comments[k]]
+    if start == len(lines):
+        return before[0] if before else (0, _uncommented(lines[0][1], 0))
+    words = [
+        (k, cells)
+        for k, cells in before
+        if len(cells) in sizes and not _is_units(cells) and not any(map(_value, cells))
+    ]
+    for k, cells in words:
+        if all(cells[: sizes[0]]) and not repeated(cells[: sizes[0]]):
+            return k, cells
+    if words:
+        return words[-1][0], _joined([cells for _, cells in words])
+    if before and before[-1][0] == start - 1 and len(before[-1][1]) > 1 and not _is_units(before[-1][1]):
+        return before[-1]
+    for k in reversed(range(start)):
+        names = _uncommented(lines[k][1], sizes[0])
+        if len(names) in sizes and len(names) > 1 and not repeated(names) and not any(map(_value, names)):
+            return k, names
+    return -1, []
+
+
+def _joined(names: list[list[str]]) -> list[str]:
+    """The names of the last of some lines; those that repeat with the names above them, such as "marker_X"."""
+    *above, header = names
+    twice = {name for name in repeated(header) if name}
+    for line in above:
+        for k in range(1, len(line)):
+            line[k] = line[k] or line[k - 1]  # a name stands above the first of its columns alone
+    for chosen in (*combinations(above, 1), *combinations(above, 2)):
+        each = zip(*chosen, header, strict=False)
+        found = ["_".join(cells) if cells[-1] in twice else cells[-1] for cells in each]
+        if twice and not any(repeated(found)):
+            return found
+    return header
+
+
+def unit_of(text: str) -> str:
+    """The unit that a text is, in small letters without brackets; empty if it is none."""
+    bare = text.lower().replace("\u03bc", "µ").strip("[](){}<> ")
+    return bare if bare in LENGTHS | ANGLES or OTHERS.fullmatch(bare) else ""
+
+
+def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
+    """The unit of length or angle in brackets after the name of a column, or in a row of units; None without any."""
+    bracket = re.search(r"[\[(][^\[(]*[\])]$", column)
+    return (LENGTHS | ANGLES).get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
+
+
+def _is_units(cells: Sequence[str]) -> bool:
+    """Whether a line holds units alone, of at least one column."""
+    return all(map(unit_of, filter(None, cells))) and any(unit_of(cell) not in ("", "-", "none") for cell in cells)
+
+
+def _is_comment(cells: Sequence[str]) -> bool:
+    return cells[0].startswith(COMMENTS) and number(cells[0], ".") is None
+
+
+def _uncommented(cells: list[str], width: int) -> list[str]:
+    """A comment without its mark, and the cell that it fills."""
+    first = cells[0].lstrip("#%/ ") if _is_comment(cells) else cells[0]
+    return cells[1:] if not first and len(cells) > width > 0 else [first or cells[0], *cells[1:]]
+
+
+def _value(text: str) -> bool:
+    """Whether a text is a number, with any decimal mark."""
+    values = (number(text, decimal) for decimal in ".,")
+    return any(value is not None and not isnan(value) for value in values)
+
+
+def _numbers(cells: Sequence[str]) -> int:
+    """How many cells are numbers; 0 where they are less than half of those that are filled, or count the columns."""
+    filled = [cell for cell in cells if number(cell, ".") is None or _value(cell)]
+    found = sum(map(_value, filled))
+    counted = found > 3 and filled in ([str(k + first) for k in range(len(filled))] for first in (0, 1))
+    return 0 if counted or 2 * found < len(filled) else found
