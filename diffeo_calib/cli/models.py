@@ -13,12 +13,15 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 
@@ -31,8 +34,23 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
 
 
 def load_robot(given: Robot) -> Tree:
-    """The robot in a URDF."""
-    return load_urdf(given.robot, given.base, list(dict.fromkeys(given.tip)), given.load or ())
+    """The robot in a URDF, or in a table of Denavit-Hartenberg parameters."""
+    tips = list(dict.fromkeys(given.tip or ()))
+    if is_urdf(given.robot):
+        if given.dh is not None:
+            raise InputError.of(f"--dh beside a URDF, '{given.robot}'", fix="leave it out")
+        return load_urdf(given.robot, given.base, tips or None, given.load or ())
+    if given.base is not None or given.load or len(tips) > 1:
+        what, expected = f"--base or --load of a DH table, '{given.robot}'", "its whole chain, or one --tip"
+        raise InputError.of(what, expected=expected, fix="leave them out, or pass a URDF")
+    return DHFile.read(given.robot).chain(given.dh, *tips)
+
+
+def is_urdf(path: Path) -> bool:
+    """Whether a file is meant as a URDF."""
+    if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
+        return True
+    return read_regular(path, "robot's description", LARGEST_FILE).lstrip()[:1] == b"<"
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:

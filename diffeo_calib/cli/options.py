@@ -164,17 +164,23 @@ class Rows:
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
+DH = "Convention of a DH table that does not say it itself; modified is Craig's."
+Convention = Literal["standard", "modified"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """Which robot was measured."""
 
-    robot: Path = option("The robot's description.", "URDF", default=...)
-    base: str = option("First link of the chain.", "LINK", default=...)
-    tip: list[str] = option(
-        "Last link of the chain, to which the markers are fixed; for several tips once per --position.",
+    robot: Path = option(ROBOT, "FILE", default=...)
+    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
+    tip: list[str] | None = option(
+        "Last link of the chain, to which the markers are fixed; for several tips once per --position. By default the "
+        "last one, if the URDF has one; of a DH table the name of a joint, after the last one by default.",
         "LINK",
-        default=...,
     )
+    dh: Convention | None = option(DH)
     load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
 
 

@@ -46,7 +46,7 @@ def run(given: CampaignOptions) -> None:
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=None if limit is None else limit.value)
-        live = Live(campaign, source, given.robot.tip, journal, given)
+        live = Live(campaign, source, given.robot.tip or list(robot.tips), journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))

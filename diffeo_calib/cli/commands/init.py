@@ -1,37 +1,71 @@
-"""`diffeo-calib init`: propose the options of `fit` for a table and a URDF as a campaign file, with reasons."""
+"""`diffeo-calib init`: propose the options of `fit` for a table and a robot as a campaign file, with reasons."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
+from itertools import product, takewhile
 from math import inf
 from os.path import relpath
 from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
 
+from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
-from diffeo_calib.cli.options import CORNERS
+from diffeo_calib.cli.models import is_urdf, load_robot
+from diffeo_calib.cli.options import CORNERS, Robot
 from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.urdf import chains_in, load_urdf
+from diffeo_calib.robots.dh_file import MODIFIED, STANDARD, DHFile
+from diffeo_calib.robots.urdf import chains_in
+from diffeo_calib.robots.urdf_elements import JointElement
 
 CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
+NOT_RAISED = 1.01
+"""Ratio of residuals without and with a joint up to which the markers do not follow it."""
+FLANGES = ("flange", "tool0")
+"""Ends of the names of links to which tools are screwed."""
 COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
 """Entries that name columns."""
+
+
+class Arm(NamedTuple):
+    """The first joints of a robot, one behind the other, that the table has columns of.
+
+    Args:
+        robot: the options that describe it. joints: their names. ends: the link behind each. columns: of each.
+        how: these were found.
+    """
+
+    robot: Robot
+    joints: list[str]
+    ends: list[str]
+    columns: list[str]
+    how: str
+
+    def first(self, count: int) -> Arm:
+        """The first joints of these alone."""
+        robot = replace(self.robot, tip=[self.ends[count - 1]])
+        return Arm(robot, self.joints[:count], self.ends[:count], self.columns[:count], self.how)
 
 
 def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     csv, output = given.csv, given.output
+    if csv.is_dir():
+        read_cells(csv, ",")  # says why not
     sheet = guess_sheet(csv)
-    choices = list(_choices(csv, given.urdf, output, sheet))
+    choices = list(_choices(csv, given.robot, output, sheet))
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -48,43 +82,140 @@ def run(given: InitOptions) -> None:
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
 
 
-def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
-    folder = output.parent
+def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
+    folder, urdf = output.parent, is_urdf(robot)
     yield Choice("csv", relpath(csv, folder), "the table")
-    yield Choice("robot", relpath(urdf, folder), "the URDF")
-    base, tip, (joints, how), why = _chain(urdf, sheet)
-    rows = proposals.rows_in(csv, sheet, joints)
-    tips = proposals.tips_of(rows.markers, [leaf for _, leaf, _ in chains_in(urdf)])
-    chain = load_urdf(urdf, base, list(dict.fromkeys(tips)) or tip)
-    if tips:
-        joints, how = guess_joints(sheet.numbers, chain.joint_names) or (joints, how)
-    yield Choice("base", base, why)
-    leaf = "a leaf below it; the markers are fixed to it or to a link before it"
-    yield Choice("tip", tips, "leaves after which the columns are named") if tips else Choice("tip", tip, leaf)
-    yield Choice("joints", ",".join(joints), how)
-    yield from rows.entries()
+    yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
+    arm, seen, units = _explained(csv, robot, sheet)
+    arm, seen, why = _with_tip(arm, seen, _format(units, sheet))
+    units = list(_units(seen, sheet)) if ";" in why else units
+    if urdf:
+        yield Choice("base", arm.robot.base or "", "root of the URDF")
+    if arm.robot.dh is not None:
+        yield Choice("dh", arm.robot.dh, "the convention with which it explains the rows")
+    if seen.tips:
+        yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
+    elif arm.robot.tip is not None:
+        yield Choice("tip", arm.robot.tip[0], why)
+    yield Choice("joints", ",".join(seen.joints), arm.how)
+    for choice in seen.rows.entries():
+        yield choice._replace(value=_from_folder(choice.value, folder))
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
-    units = list(_units(seen, sheet))
     yield from units
-    found = {choice.name: str(choice.value) for choice in units}
-    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    if "rotation" not in found:
-        yield from proposals.beside(replace(seen, table=table), sheet)
+    if not any(choice.name == "rotation" for choice in units):
+        yield from proposals.beside(replace(seen, table=_format(units, sheet)), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
-def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
-    """First and last link of the longest chain whose joints the table has, and the columns of its joints."""
-    chains = chains_in(urdf)
-    for base, tip, joints in chains:
-        found = guess_joints(sheet.numbers, joints) if joints else None
-        if found is not None:
-            return base, tip, found, f"root of the URDF; {len(joints)} joints to {tip}"
-    expected = " or ".join(few(joints, 20) for _, _, joints in chains[:3]) or "a robot with joints"
-    raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
+def _from_folder(value: Any, folder: Path) -> Any:
+    """Files of cameras in texts of --reading relative to the folder of the campaign."""
+    if isinstance(value, list):
+        return [_from_folder(text, folder) for text in value]
+    named = isinstance(value, str) and value.startswith(CORNERS) and value.endswith(".yaml")
+    return CORNERS + relpath(value.removeprefix(CORNERS), folder) if named else value
+
+
+def _format(units: list[Choice], sheet: Sheet) -> TableFormat:
+    """The format of positions and joints in these units."""
+    found = {choice.name: choice.value for choice in units}
+    on_tool = "camera-on-tool" in found and "rotation" not in found
+    return TableFormat(str(found["length"]), str(found["angle"]), sheet.sep, sheet.decimal, camera_on_tool=on_tool)
+
+
+Explained = tuple[Arm, Source, list[Choice]]
+"""Joints, the table as their rows, and its units."""
+
+
+def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
+    """The joints that explain the rows best; InputError if none do, or a DH table in both conventions."""
+    found, refused = list[Explained](), list[InputError]()
+    leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
+    for arm in _arms(robot, sheet):
+        try:
+            rows = proposals.rows_in(csv, sheet, arm.columns)
+            tips = proposals.tips_of(rows.markers, leaves)
+            chain = load_robot(replace(arm.robot, tip=tips or arm.robot.tip))
+            joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
+            columns = arm.columns if joints is None else joints[0]
+            seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+            found.append((arm, seen, list(_units(seen, sheet))))
+        except InputError as error:
+            refused.append(error)
+    if len(found) < 2:
+        if not found:
+            raise refused[0]
+        return found[0]
+    best = min(found, key=lambda one: one[1].residual(_format(one[2], sheet)))
+    alike = sorted((seen.residual(_format(best[2], sheet)), arm.robot.dh) for arm, seen, _ in found)
+    if best[0].robot.dh and not proposals.is_clear(alike, CLEAR_RATIO):
+        got = "; ".join(f"{way}: {best[1].size(residual)}" for residual, way in alike)
+        what, fix = f"the convention of '{robot}'", "say it in the file, by a line such as `# modified`"
+        raise InputError.of(what, expected="one that explains the rows far better", got=got, fix=fix)
+    return best
+
+
+def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
+    """As many joints of a robot as the table has columns of; of a DH table in the conventions that it may have."""
+    whole = list[tuple[Robot, list[str], list[str]]]()
+    if is_urdf(robot):
+        for path in (paths := chains_in(robot)):
+            moving = [joint for joint in path if joint.kind != "fixed" and joint.driver is None]
+            ends = [_end_behind(path, joint, paths) for joint in moving]
+            whole.append((Robot(robot=robot, base=path[0].parent), [joint.name for joint in moving], ends))
+    else:
+        table = DHFile.read(robot)
+        ways = [None] if table.convention else [STANDARD, MODIFIED]
+        whole += [(Robot(robot=robot, dh=way), table.names, table.names) for way in ways]
+    arms = list[Arm]()
+    for options, joints, ends in whole:
+        for count in range(len(joints), 0, -1):
+            guessed = guess_joints(sheet.numbers, joints[:count])
+            series = guessed is not None and guessed[1].startswith("numbered")
+            if guessed is not None and (2 * count > len(joints) or not series):  # a short series may be of anything
+                arm = Arm(options, joints[:count], ends, guessed[0], guessed[1])
+                arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
+                break
+    if not arms:
+        longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
+        expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
+        raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20))
+    most = max(len(arm.joints) for arm in arms)
+    return list({(*arm.joints, arm.robot.dh): arm for arm in arms if len(arm.joints) == most}.values())
+
+
+def _with_tip(arm: Arm, seen: Source, table: TableFormat) -> tuple[Arm, Source, str]:
+    """The joints without those at the end that no marker follows, and why the tip is behind the last."""
+    q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
+    moved, left_out = (q.amax(0) - q.amin(0)).tolist(), list[str]()
+    while len(arm.joints) > 1 and not seen.tips:
+        count = len(arm.joints) - 1
+        shorter, last = arm.first(count), arm.joints[count]
+        without = replace(seen, robot=load_robot(shorter.robot), joints=shorter.columns)
+        if moved[count] < UNMOVED_JOINT_RANGE:
+            left_out.append(f"{last} hardly moves in the table")
+        else:
+            an_arm_s = moved[count] > median(moved) / 2  # its axis may run through the marker
+            size, residual = seen.residual(table), without.residual(table)
+            if size > proposals.LARGEST_RESIDUAL or residual > size * (1 / CLEAR_RATIO if an_arm_s else NOT_RAISED):
+                break
+            words = f"with {last} the residual of the nominal robot is {seen.size(size)}, without it"
+            left_out.append(f"{words} {seen.size(residual)}")
+        arm, seen = shorter, without
+    return arm, seen, "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+
+
+def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
+    """The flange, by usual names, or the link of a joint; behind joints that follow this or earlier ones."""
+    place = path.index(joint)
+    above = {one.name for one in path[: place + 1]}
+    behind = [joint, *takewhile(lambda one: one.kind == "fixed" or one.driver in above, path[place + 1 :])]
+    links = [[one.child for one in behind if one.kind != "fixed"][-1]]
+    fixed = {one.child: one.parent for path in paths for one in path if one.kind == "fixed"}
+    for link in links:
+        links += [child for child, parent in fixed.items() if parent == link]
+    return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])
 
 
 def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:

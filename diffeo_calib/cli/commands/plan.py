@@ -17,8 +17,8 @@ from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor, Where
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
-from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
+from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
+from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Robot
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
@@ -28,7 +28,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 SENSORS = {
@@ -105,9 +104,9 @@ def run(given: PlanOptions) -> None:
 
 
 def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
-    """A chain in a URDF, and the markers (P, 3) on its tip, m."""
-    tips = given.tip or []
-    robot = load_urdf(given.robot or "", given.base or "", tips[0] if len(tips) == 1 else tips)
+    """The robot, and the markers (P, 3) on its tip, m."""
+    described = Robot(robot=given.robot or Path(), base=given.base, tip=given.tip, dh=given.dh)
+    robot = load_robot(described)
     numbers = [_numbers("--marker", text, (3,)) for text in given.marker or ()]
     places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
     return robot, places / table.per_metre if numbers else places

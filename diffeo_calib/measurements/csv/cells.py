@@ -101,6 +101,9 @@ class CsvLines:
         except FileNotFoundError as error:
             fix = f"check the name and the folder (searched from '{Path.cwd()}')"
             raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
+        except IsADirectoryError as error:
+            fix = f"of images of a board run `diffeo-calib images '{path}' JOINTS.csv ...` first, and pass its table"
+            raise MeasurementError.of(f"'{path}' is a folder", expected="a table", fix=fix) from error
         except OSError as error:
             fix = "pass the name of a readable file"
             raise MeasurementError.of(f"file '{path}' cannot be opened ({error.strerror})", fix=fix) from error
