@@ -11,7 +11,6 @@ import typer
 from diffeo_calib.cli.app import Command, command
 from diffeo_calib.cli.options import (
     CONVENTION,
-    DH,
     LARGEST_SEED,
     PAYLOAD,
     ROBOT,
@@ -22,6 +21,7 @@ from diffeo_calib.cli.options import (
     Convention,
     Frame,
     Length,
+    Links,
     Robot,
     Rows,
     StoredUnits,
@@ -291,9 +291,7 @@ class ExportOptions(Command):
     urdf: Path | None = written("Write the robot's own URDF with corrected joint origins.", "URDF")
     mjcf: Path | None = written("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = written("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
-    dh_convention: Literal["standard", "craig"] = option(
-        "Convention of --dh; craig is also called modified.", default="standard"
-    )
+    dh_convention: Convention = option("Convention of --dh; craig is also called modified.", default="standard")
     ur_kinematics: Path | None = written("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
     ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
     joint_offsets: Path | None = written("Write the best joint offsets, all other geometry nominal.", "CSV")
@@ -368,13 +366,7 @@ class PlanOptions(Command):
         "MODEL", "Model file written by `fit`, to plan the next poses; or name a --robot.", default=None
     )
     robot: Path | None = option(f"To plan the first poses. {ROBOT}", "FILE")
-    base: str | None = option("With --robot: first link of the chain; by default that of the file.", "LINK")
-    tip: list[str] | None = option(
-        "With --robot: last link of the chain, by default that of the file; the markers are fixed to it. Repeat for "
-        "more: each has them.",
-        "LINK",
-    )
-    dh: Convention | None = option(DH)
+    links: Links
     marker: list[str] | None = option(
         "With --robot: place of a marker in the frame of the tip, in the unit of --length; repeat for more. "
         "By default 0.1 m beside and 0.1 m in front of the tip.",
@@ -395,14 +387,8 @@ class PlanOptions(Command):
     payload_mass: float | None = option(MASS, "MASS")
 
     def check(self) -> None:
-        links = {
-            "--robot": self.robot,
-            "--base": self.base,
-            "--tip": self.tip,
-            "--dh": self.dh,
-            "--marker": self.marker,
-        }
-        named = [name for name, value in links.items() if value is not None]
+        known = {"robot": self.robot, **vars(self.links), "marker": self.marker}
+        named = [f"--{name.replace('_', '-')}" for name, value in known.items() if value is not None]
         if self.model is not None and named:
             fix = "leave them out: the model knows its robot and its markers"
             raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Links, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
@@ -33,17 +33,17 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
     return model
 
 
-def load_robot(given: Robot) -> Tree:
+def load_robot(path: Path, links: Links) -> Tree:
     """The robot in a URDF, or in a table of Denavit-Hartenberg parameters."""
-    tips = list(dict.fromkeys(given.tip or ()))
-    if is_urdf(given.robot):
-        if given.dh is not None:
-            raise InputError.of(f"--dh beside a URDF, '{given.robot}'", fix="leave it out")
-        return load_urdf(given.robot, given.base, tips or None, given.load or ())
-    if given.base is not None or given.load or len(tips) > 1:
-        what, expected = f"--base or --load of a DH table, '{given.robot}'", "its whole chain, or one --tip"
+    tips = list(dict.fromkeys(links.tip or ()))
+    if is_urdf(path):
+        if links.dh_convention is not None:
+            raise InputError.of(f"--dh-convention of a URDF, '{path}'", fix="leave it out")
+        return load_urdf(path, links.base, tips or None, links.load or ())
+    if links.base is not None or links.load or len(tips) > 1:
+        what, expected = f"--base or --load of a DH table, '{path}'", "its whole chain, or one --tip"
         raise InputError.of(what, expected=expected, fix="leave them out, or pass a URDF")
-    return DHFile.read(given.robot).chain(given.dh, *tips)
+    return DHFile.read(path).chain(links.dh_convention, *tips)
 
 
 def is_urdf(path: Path) -> bool:

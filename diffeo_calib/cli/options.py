@@ -165,8 +165,23 @@ class Rows:
 
 
 ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
-DH = "Convention of a DH table that does not say it itself; modified is Craig's."
-Convention = Literal["standard", "modified"]
+Convention = Literal["standard", "craig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links:
+    """Which part of the robot in a file."""
+
+    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
+    tip: list[str] | None = option(
+        "Last link of the chain, to which the markers are fixed, by default that of the file; for several tips once "
+        "per --position. Of a DH table the last joint.",
+        "LINK",
+    )
+    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
+    dh_convention: Convention | None = option(
+        "Convention of a DH table that does not say its own; craig is also called modified."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,14 +189,7 @@ class Robot:
     """Which robot was measured."""
 
     robot: Path = option(ROBOT, "FILE", default=...)
-    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
-    tip: list[str] | None = option(
-        "Last link of the chain, to which the markers are fixed; for several tips once per --position. By default the "
-        "last one, if the URDF has one; of a DH table the name of a joint, after the last one by default.",
-        "LINK",
-    )
-    dh: Convention | None = option(DH)
-    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
+    links: Links
 
 
 @dataclass(frozen=True, kw_only=True)

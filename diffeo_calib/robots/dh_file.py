@@ -41,8 +41,7 @@ KINDS = {
     **dict.fromkeys(("prismatic", "p", "linear", "slide", "translational", "1"), "prismatic"),
 }
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "rad": 1.0, "deg": pi / 180}
-STANDARD, MODIFIED = "standard", "modified"
-WORDS = {STANDARD: "standard|classic|classical|distal|sdh", MODIFIED: "modified|craig|proximal|mdh"}
+WORDS = {"standard": "standard|classic|classical|distal|sdh", "craig": "craig|modified|proximal|mdh"}
 """Words of a file, or of its name, that say its convention."""
 PLAIN = str.maketrans({"α": "alpha", "θ": "theta", "ϑ": "theta", "β": "beta", "π": "pi", "−": "-", "$": "", "\\": ""})
 UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
@@ -62,7 +61,7 @@ class DHFile:
 
     Args:
         path: the file. names: of the joints. rows: their parameters [m, rad].
-        convention: STANDARD or MODIFIED, empty if the file does not say it. units: how it was read, in words.
+        convention: "standard" or "craig", empty if the file does not say it. units: how it was read, in words.
     """
 
     path: Path
@@ -83,9 +82,11 @@ class DHFile:
         header, cells = _cells(path, lines)
         rows = [dict(zip(map(_what, header), row, strict=True)) for row in cells]
         said = {way for way, words in WORDS.items() if _mention([path.stem, *lines], words)}
-        said |= {MODIFIED for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
+        said |= {"craig" for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
         if len(said) > 1:
-            raise RobotError.of(f"'{path}' names two conventions", expected="standard or modified, in one place")
+            raise RobotError.of(
+                f"'{path}' names two conventions", expected="standard or craig (modified), in one place"
+            )
         own = {_what(cell): found[1].lower().replace("°", "deg") for cell in header if (found := UNIT.search(cell))}
         units = _likely_units(rows) | own
         if not units["alpha"] or not units["theta"]:
@@ -101,7 +102,7 @@ class DHFile:
         """The robot from "base" to "tip", or up to a joint.
 
         Args:
-            convention: STANDARD or MODIFIED, if the file does not say it. tip: name of the joint.
+            convention: "standard" or "craig", if the file does not say it. tip: name of the joint.
 
         Raises:
             RobotError: no convention, or another one than that of the file; no such joint.
@@ -110,17 +111,16 @@ class DHFile:
         if not way or convention not in (None, way):
             what, fix = (
                 f"the convention of '{self.path}'",
-                "say it by --dh; `diffeo-calib init` finds the one that fits",
+                "say it by --dh-convention; `init` finds the one that fits",
             )
             got = f"{convention}, but the file says {way}" if way else "neither in the file"
-            raise RobotError.of(what, expected=f"{STANDARD} or {MODIFIED} (Craig's)", got=got, fix=fix)
+            raise RobotError.of(what, expected="standard or craig (modified)", got=got, fix=fix)
         if tip not in (None, *self.names):
             raise RobotError.of(
                 f"--tip of '{self.path}'", expected=f"one of {few(self.names, 20)}", got=shown(str(tip))
             )
         count = len(self.names) if tip is None else self.names.index(tip) + 1
-        of_dh = "craig" if way == MODIFIED else way
-        found = from_dh(self.rows[:count], of_dh, self.names[:count], self.path.stem)
+        found = from_dh(self.rows[:count], way, self.names[:count], self.path.stem)
         return Chain(found.name, found.base, tip or found.tip, found.joints)
 
 

@@ -153,15 +153,17 @@ def write_dh_arm(folder: Path, convention: str, scale: float, joints: str, table
     write_measurements(folder / "t.csv", dc.Measurements(q, points, robot.joint_names), table, position=("x", "y", "z"))
 
 
-@pytest.mark.parametrize(("convention", "word", "scale"), [("standard", "standard", 1.0), ("craig", "modified", 1e3)])
-def test_the_convention_that_explains_the_rows(
-    convention: str, word: str, scale: float, tmp_path: Path, command: Command
-) -> None:
+@pytest.mark.parametrize(("convention", "scale"), [("standard", 1.0), ("craig", 1e3)])
+def test_the_convention_that_explains_the_rows(convention: str, scale: float, tmp_path: Path, command: Command) -> None:
     write_dh_arm(tmp_path, convention, scale, "J{}", TableFormat("mm", "deg"))
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.csv", "-o", tmp_path / "c.toml")
     assert done.code == 0, done.err
     entries, reasons = proposed(tmp_path)
-    assert (entries["robot"], entries["dh"], entries["joints"]) == ("arm.csv", word, "J1,J2,J3,J4,J5,J6")
+    assert (entries["robot"], entries["dh-convention"], entries["joints"]) == (
+        "arm.csv",
+        convention,
+        "J1,J2,J3,J4,J5,J6",
+    )
     assert not {"base", "tip"} & set(entries)
     assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons["robot"]
     fitted = command(
@@ -175,7 +177,7 @@ def test_the_convention_that_explains_the_rows(
         "-o",
         tmp_path / "m.safetensors",
     )
-    assert "--dh; `diffeo-calib init` finds the one that fits" in fitted.error
+    assert "--dh-convention; `init` finds the one that fits" in fitted.error
 
 
 @pytest.mark.slow
@@ -193,8 +195,8 @@ def test_the_proposal_for_a_dh_table_runs(tmp_path: Path, command: Command) -> N
         "6",
         "--robot",
         tmp_path / "arm.csv",
-        "--dh",
-        "modified",
+        "--dh-convention",
+        "craig",
         "--draw",
         "50",
         "--length",
@@ -215,13 +217,13 @@ def test_a_last_row_without_a_joint_and_options_that_do_not_belong(tmp_path: Pat
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.csv", "-o", tmp_path / "c.toml")
     assert done.code == 0, done.err
     entries, _ = proposed(tmp_path)
-    assert (entries["tip"], "dh" in entries) == ("joint_6", False)
+    assert (entries["tip"], "dh-convention" in entries) == ("joint_6", False)
     words = ["fit", tmp_path / "t.csv", "--length", "mm", "--angle", "deg", "--position", "x,y,z", "-o", tmp_path / "m"]
     ARM.write_urdf(tmp_path / "arm.urdf")
     for robot, option, message in (
         ("arm.csv", ["--base", "link"], "--base or --load of a DH table"),
         ("arm.csv", ["--tip", "flange"], "expected one of joint_1, joint_2"),
-        ("arm.urdf", ["--dh", "modified"], "--dh beside a URDF"),
+        ("arm.urdf", ["--dh-convention", "craig"], "--dh-convention of a URDF"),
     ):
         assert message in command(*words, "--robot", tmp_path / robot, *option).error
 

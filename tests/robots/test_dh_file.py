@@ -10,7 +10,7 @@ import torch
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import DHRow, from_dh
-from diffeo_calib.robots.dh_file import MODIFIED, STANDARD, DHFile
+from diffeo_calib.robots.dh_file import DHFile
 
 ROWS = [
     DHRow(0.05, -pi / 2, 0.4, 0.0, lower=-3.0, upper=2.5),
@@ -88,8 +88,8 @@ def test_spellings_orders_and_units(name: str, tmp_path: Path) -> None:
     (tmp_path / "arm.csv").write_text(FILES[name], encoding="utf-8")
     table = DHFile.read(tmp_path / "arm.csv")
     assert not table.convention
-    for word, convention in ((STANDARD, "standard"), (MODIFIED, "craig")):
-        chain = table.chain(word)
+    for convention in ("standard", "craig"):
+        chain = table.chain(convention)
         torch.testing.assert_close(chain(Q), from_dh(ROWS, convention)(Q), rtol=0, atol=1e-10)
         assert chain.kinds == ("revolute", "revolute", "prismatic", "revolute")
     assert (chain.name, chain.base, chain.tip) == ("arm", "base", "tip")
@@ -100,12 +100,12 @@ def test_spellings_orders_and_units(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "convention"),
     [
-        (lines(",", "theta,d,a,alpha", [[0, 1, 0.2, 1.5708]], "# Craig's parameters"), MODIFIED),
-        (lines(",", "alpha_{i-1},a_{i-1},d_i,theta_i", [[1.5708, 0.2, 1, 0]]), MODIFIED),
-        (lines(",", "alphai-1 (rad),ai-1 (m),di (m),thetai (rad)", [[1.5708, 0.2, 1, 0]]), MODIFIED),
-        (lines(",", "alpha_prev,a_prev,d,theta", [[1.5708, 0.2, 1, 0]]), MODIFIED),
-        (lines(",", "theta,d,a,alpha,convention", [[0, 1, 0.2, 1.5708, "standard"]]), STANDARD),
-        (lines(",", "theta,d,a,alpha", [[0, 1, 0.2, 1.5708]], "Classic DH table of the cell"), STANDARD),
+        (lines(",", "theta,d,a,alpha", [[0, 1, 0.2, 1.5708]], "# Craig's parameters"), "craig"),
+        (lines(",", "alpha_{i-1},a_{i-1},d_i,theta_i", [[1.5708, 0.2, 1, 0]]), "craig"),
+        (lines(",", "alphai-1 (rad),ai-1 (m),di (m),thetai (rad)", [[1.5708, 0.2, 1, 0]]), "craig"),
+        (lines(",", "alpha_prev,a_prev,d,theta", [[1.5708, 0.2, 1, 0]]), "craig"),
+        (lines(",", "theta,d,a,alpha,convention", [[0, 1, 0.2, 1.5708, "standard"]]), "standard"),
+        (lines(",", "theta,d,a,alpha", [[0, 1, 0.2, 1.5708]], "Classic DH table of the cell"), "standard"),
         (lines(",", "theta_i,d_i,a_i,alpha_i", [[0, 1, 0.2, 1.5708]]), ""),
     ],
 )
@@ -114,18 +114,18 @@ def test_what_a_file_says_of_its_convention(text: str, convention: str, tmp_path
     table = DHFile.read(tmp_path / "arm.csv")
     assert table.convention == convention
     if convention:
-        other = MODIFIED if convention == STANDARD else STANDARD
+        other = "craig" if convention == "standard" else "standard"
         with pytest.raises(RobotError, match=f"got {other}, but the file says {convention}"):
             table.chain(other)
     else:
-        with pytest.raises(RobotError, match=r"expected standard or modified \(Craig's\), got neither.*--dh"):
+        with pytest.raises(RobotError, match=r"expected standard or craig \(modified\), got neither.*--dh-convention"):
             table.chain()
 
 
 def test_limits_and_a_tip_before_the_last_row(tmp_path: Path) -> None:
     rows = [[r.a, r.alpha, r.d, r.theta, *((-3, 2.5) if k == 0 else ("", ""))] for k, r in enumerate(ROWS)]
     (tmp_path / "arm.csv").write_text(lines(",", "a,alpha,d,theta,min,max", rows))
-    chain = DHFile.read(tmp_path / "arm.csv").chain(STANDARD, "joint_2")
+    chain = DHFile.read(tmp_path / "arm.csv").chain("standard", "joint_2")
     assert chain.limits[0].tolist() == [-3.0, 2.5]
     assert chain.limits[1].isinf().all()
     assert (chain.n, chain.tip) == (2, "joint_2")

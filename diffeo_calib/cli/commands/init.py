@@ -9,7 +9,7 @@ from math import inf
 from os.path import relpath
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import proposals
@@ -17,7 +17,7 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Robot
+from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
@@ -25,7 +25,7 @@ from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.dh_file import MODIFIED, STANDARD, DHFile
+from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
 
@@ -43,11 +43,11 @@ class Arm(NamedTuple):
     """The first joints of a robot, one behind the other, that the table has columns of.
 
     Args:
-        robot: the options that describe it. joints: their names. ends: the link behind each. columns: of each.
+        links: the options that name them. joints: their names. ends: the link behind each. columns: of each.
         how: these were found.
     """
 
-    robot: Robot
+    links: Links
     joints: list[str]
     ends: list[str]
     columns: list[str]
@@ -55,8 +55,8 @@ class Arm(NamedTuple):
 
     def first(self, count: int) -> Arm:
         """The first joints of these alone."""
-        robot = replace(self.robot, tip=[self.ends[count - 1]])
-        return Arm(robot, self.joints[:count], self.ends[:count], self.columns[:count], self.how)
+        links = replace(self.links, tip=[self.ends[count - 1]])
+        return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how)
 
 
 def run(given: InitOptions) -> None:
@@ -87,16 +87,16 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
     yield Choice("csv", relpath(csv, folder), "the table")
     yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
     arm, seen, units = _explained(csv, robot, sheet)
-    arm, seen, why = _with_tip(arm, seen, _format(units, sheet))
+    arm, seen, why = _with_tip(robot, arm, seen, _format(units, sheet))
     units = list(_units(seen, sheet)) if ";" in why else units
     if urdf:
-        yield Choice("base", arm.robot.base or "", "root of the URDF")
-    if arm.robot.dh is not None:
-        yield Choice("dh", arm.robot.dh, "the convention with which it explains the rows")
+        yield Choice("base", arm.links.base or "", "root of the URDF")
+    if arm.links.dh_convention is not None:
+        yield Choice("dh-convention", arm.links.dh_convention, "the convention with which it explains the rows")
     if seen.tips:
         yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
-    elif arm.robot.tip is not None:
-        yield Choice("tip", arm.robot.tip[0], why)
+    elif arm.links.tip is not None:
+        yield Choice("tip", arm.links.tip[0], why)
     yield Choice("joints", ",".join(seen.joints), arm.how)
     for choice in seen.rows.entries():
         yield choice._replace(value=_from_folder(choice.value, folder))
@@ -136,7 +136,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
         try:
             rows = proposals.rows_in(csv, sheet, arm.columns)
             tips = proposals.tips_of(rows.markers, leaves)
-            chain = load_robot(replace(arm.robot, tip=tips or arm.robot.tip))
+            chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
             joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
             columns = arm.columns if joints is None else joints[0]
             seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
@@ -148,26 +148,26 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
             raise refused[0]
         return found[0]
     best = min(found, key=lambda one: one[1].residual(_format(one[2], sheet)))
-    alike = sorted((seen.residual(_format(best[2], sheet)), arm.robot.dh) for arm, seen, _ in found)
-    if best[0].robot.dh and not proposals.is_clear(alike, CLEAR_RATIO):
-        got = "; ".join(f"{way}: {best[1].size(residual)}" for residual, way in alike)
-        what, fix = f"the convention of '{robot}'", "say it in the file, by a line such as `# modified`"
+    alike = {arm.links.dh_convention: seen.residual(_format(best[2], sheet)) for arm, seen, _ in found}
+    if len(alike) > 1 and not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
+        got = "; ".join(f"{way}: {best[1].size(size)}" for way, size in alike.items())
+        what, fix = f"the convention of '{robot}'", "say it in the file, by a line such as `# craig`"
         raise InputError.of(what, expected="one that explains the rows far better", got=got, fix=fix)
     return best
 
 
 def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     """As many joints of a robot as the table has columns of; of a DH table in the conventions that it may have."""
-    whole = list[tuple[Robot, list[str], list[str]]]()
+    whole = list[tuple[Links, list[str], list[str]]]()
     if is_urdf(robot):
         for path in (paths := chains_in(robot)):
             moving = [joint for joint in path if joint.kind != "fixed" and joint.driver is None]
             ends = [_end_behind(path, joint, paths) for joint in moving]
-            whole.append((Robot(robot=robot, base=path[0].parent), [joint.name for joint in moving], ends))
+            whole.append((Links(base=path[0].parent), [joint.name for joint in moving], ends))
     else:
         table = DHFile.read(robot)
-        ways = [None] if table.convention else [STANDARD, MODIFIED]
-        whole += [(Robot(robot=robot, dh=way), table.names, table.names) for way in ways]
+        ways = [None] if table.convention else get_args(Convention)
+        whole += [(Links(dh_convention=way), table.names, table.names) for way in ways]
     arms = list[Arm]()
     for options, joints, ends in whole:
         for count in range(len(joints), 0, -1):
@@ -182,17 +182,17 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
         expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
         raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20))
     most = max(len(arm.joints) for arm in arms)
-    return list({(*arm.joints, arm.robot.dh): arm for arm in arms if len(arm.joints) == most}.values())
+    return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
 
-def _with_tip(arm: Arm, seen: Source, table: TableFormat) -> tuple[Arm, Source, str]:
+def _with_tip(robot: Path, arm: Arm, seen: Source, table: TableFormat) -> tuple[Arm, Source, str]:
     """The joints without those at the end that no marker follows, and why the tip is behind the last."""
     q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
     moved, left_out = (q.amax(0) - q.amin(0)).tolist(), list[str]()
     while len(arm.joints) > 1 and not seen.tips:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
-        without = replace(seen, robot=load_robot(shorter.robot), joints=shorter.columns)
+        without = replace(seen, robot=load_robot(robot, shorter.links), joints=shorter.columns)
         if moved[count] < UNMOVED_JOINT_RANGE:
             left_out.append(f"{last} hardly moves in the table")
         else:

@@ -18,7 +18,7 @@ from diffeo_calib.calibration.planning.sensors import Sensor, Where
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Robot
+from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
@@ -105,8 +105,7 @@ def run(given: PlanOptions) -> None:
 
 def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
     """The robot, and the markers (P, 3) on its tip, m."""
-    described = Robot(robot=given.robot or Path(), base=given.base, tip=given.tip, dh=given.dh)
-    robot = load_robot(described)
+    robot = load_robot(given.robot or Path(), given.links)
     numbers = [_numbers("--marker", text, (3,)) for text in given.marker or ()]
     places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
     return robot, places / table.per_metre if numbers else places
