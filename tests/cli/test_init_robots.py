@@ -1,5 +1,6 @@
 """Which robot, and which link: what `init` proposes, and what `fit` and `plan` take."""
 
+import re
 import shutil
 import sys
 from math import degrees, pi
@@ -109,6 +110,25 @@ def test_links_without_usual_names_and_joints_that_follow(tmp_path: Path, comman
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
     assert done.code == 0, done.err
     assert proposed(tmp_path)[0]["tip"] == "plate"
+
+
+def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, command: Command) -> None:
+    """Numbered columns may be of either arm; named after its joints they are of one."""
+    write_arm(tmp_path, [])
+    body = (tmp_path / "arm.urdf").read_text().partition('<robot name="simulated_arm">')[2].partition("</robot>")[0]
+    arms = [re.sub(r'(<link name|<joint name|link)="', rf'\1="{side}_', body) for side in ("left", "right")]
+    mount = '<joint name="{0}" type="fixed"><parent link="torso"/><child link="{0}_base_link"/></joint>'
+    parts = ['<robot name="two"><link name="torso"/>', *(mount.format(side) for side in ("left", "right")), *arms]
+    (tmp_path / "two.urdf").write_text("".join([*parts, "</robot>"]))
+    rows = (tmp_path / "t.csv").read_text().partition("\n")[2]
+    series, named = [f"q{k}" for k in range(6)], [f"right_{name}" for name in ARM.nominal.joint_names]
+    for names, code in ((series, 1), (named, 0)):
+        (tmp_path / "t.csv").write_text(",".join([*names, "x", "y", "z"]) + "\n" + rows)
+        done = command("init", tmp_path / "t.csv", tmp_path / "two.urdf", "-o", tmp_path / "c.toml")
+        assert done.code == code, done.err
+        if code:
+            assert "expected some that explain the rows far better, got left_waist_joint" in done.error
+    assert proposed(tmp_path)[0]["tip"] == "right_flange"
 
 
 def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(tmp_path: Path, command: Command) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product, takewhile
@@ -86,9 +87,7 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
     folder, urdf = output.parent, is_urdf(robot)
     yield Choice("csv", relpath(csv, folder), "the table")
     yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
-    arm, seen, units = _explained(csv, robot, sheet)
-    arm, seen, why = _with_tip(robot, arm, seen, _format(units, sheet))
-    units = list(_units(seen, sheet)) if ";" in why else units
+    arm, why, seen, units = _explained(csv, robot, sheet)
     if urdf:
         yield Choice("base", arm.links.base or "", "root of the URDF")
     if arm.links.dh_convention is not None:
@@ -124,35 +123,46 @@ def _format(units: list[Choice], sheet: Sheet) -> TableFormat:
     return TableFormat(str(found["length"]), str(found["angle"]), sheet.sep, sheet.decimal, camera_on_tool=on_tool)
 
 
-Explained = tuple[Arm, Source, list[Choice]]
-"""Joints, the table as their rows, and its units."""
+class Explained(NamedTuple):
+    """Rows that a robot explains: its joints and why the tip is behind these, the table, and its units."""
+
+    arm: Arm
+    why: str
+    seen: Source
+    units: list[Choice]
 
 
 def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
-    """The joints that explain the rows best; InputError if none do, or a DH table in both conventions."""
-    found, refused = list[Explained](), list[InputError]()
+    """The joints, or the convention, that explain the rows; InputError if none do, or several."""
+    found, refused = dict[tuple[str | None, ...], Explained](), list[InputError]()
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     for arm in _arms(robot, sheet):
         try:
-            rows = proposals.rows_in(csv, sheet, arm.columns)
-            tips = proposals.tips_of(rows.markers, leaves)
-            chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
-            joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
-            columns = arm.columns if joints is None else joints[0]
-            seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
-            found.append((arm, seen, list(_units(seen, sheet))))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # `fit` warns of the right reading
+                rows = proposals.rows_in(csv, sheet, arm.columns)
+                tips = proposals.tips_of(rows.markers, leaves)
+                chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
+                joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
+                columns = arm.columns if joints is None else joints[0]
+                seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+                one = _with_tip(robot, Explained(arm, "", seen, list(_units(seen, sheet))), sheet)
+                found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
             refused.append(error)
-    if len(found) < 2:
-        if not found:
-            raise refused[0]
-        return found[0]
-    best = min(found, key=lambda one: one[1].residual(_format(one[2], sheet)))
-    alike = {arm.links.dh_convention: seen.residual(_format(best[2], sheet)) for arm, seen, _ in found}
-    if len(alike) > 1 and not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
-        got = "; ".join(f"{way}: {best[1].size(size)}" for way, size in alike.items())
-        what, fix = f"the convention of '{robot}'", "say it in the file, by a line such as `# craig`"
-        raise InputError.of(what, expected="one that explains the rows far better", got=got, fix=fix)
+    if not found:
+        raise refused[0]
+    if len(found) == 1:
+        return next(iter(found.values()))
+    best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, sheet)))
+    alike = {key: one.seen.residual(_format(best.units, sheet)) for key, one in found.items()}
+    if not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
+        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {best.seen.size(size)}" for key, size in alike.items())
+        fix = "say the convention in the file, by a line such as `# craig`" if best.arm.links.dh_convention else ""
+        fix = fix or "name the columns after the joints of the arm"
+        raise InputError.of(
+            f"the joints of '{robot}'", expected="some that explain the rows far better", got=got, fix=fix
+        )
     return best
 
 
@@ -185,10 +195,12 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
 
-def _with_tip(robot: Path, arm: Arm, seen: Source, table: TableFormat) -> tuple[Arm, Source, str]:
-    """The joints without those at the end that no marker follows, and why the tip is behind the last."""
+def _with_tip(robot: Path, found: Explained, sheet: Sheet) -> Explained:
+    """The same without joints at the end that no marker follows, and why."""
+    arm, _, seen, units = found
+    table, left_out = _format(units, sheet), list[str]()
     q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
-    moved, left_out = (q.amax(0) - q.amin(0)).tolist(), list[str]()
+    moved = (q.amax(0) - q.amin(0)).tolist()
     while len(arm.joints) > 1 and not seen.tips:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
@@ -203,7 +215,8 @@ def _with_tip(robot: Path, arm: Arm, seen: Source, table: TableFormat) -> tuple[
             words = f"with {last} the residual of the nominal robot is {seen.size(size)}, without it"
             left_out.append(f"{words} {seen.size(residual)}")
         arm, seen = shorter, without
-    return arm, seen, "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+    return Explained(arm, why, seen, list(_units(seen, sheet)) if left_out else units)
 
 
 def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
