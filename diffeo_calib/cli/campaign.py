@@ -24,6 +24,7 @@ from types import FrameType
 from typing import IO, Any, NamedTuple, get_args, get_origin
 
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, say, show_error
+from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.common.errors import InputError, as_written
 
 if sys.version_info >= (3, 11):
@@ -93,7 +94,9 @@ def _text(path: Path, name: str, value: object, hint: Any) -> str:
     """A value as a word; files relative to the folder of the campaign."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise InputError.of(f"{path}: {name}", expected="text or a number", got=as_written(value))
-    return str(path.parent / str(value)) if has(hint, Path) else str(value)
+    begin = CORNERS if str(value).startswith(CORNERS) and str(value).endswith(".yaml") else ""
+    file = str(value).removeprefix(begin)
+    return f"{begin}{path.parent / file}" if begin or has(hint, Path) else file
 
 
 def has(hint: Any, part: type) -> bool:

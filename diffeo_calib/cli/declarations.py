@@ -13,12 +13,15 @@ from diffeo_calib.cli.options import (
     CONVENTION,
     LARGEST_SEED,
     PAYLOAD,
+    ROBOT,
     ROTATION_ANGLE,
     Angle,
     Candidates,
     ChangeTests,
+    Convention,
     Frame,
     Length,
+    Links,
     Robot,
     Rows,
     StoredUnits,
@@ -173,14 +176,14 @@ class EvaluateOptions(Command):
 
 @command("init")
 class InitOptions(Command):
-    """Propose the options of `fit` for a table and a URDF.
+    """Propose the options of `fit` for a table and a robot.
 
     Looks at names, numbers and plausible units, and writes a campaign file with a reason for every line. Check it, then
     run `diffeo-calib fit campaign.toml`.
     """
 
     csv: Path = argument("CSV", CSV)
-    urdf: Path = argument("URDF", "The robot's description.")
+    robot: Path = argument("ROBOT", ROBOT)
     output: Path = output("Campaign file to write.", "TOML", Path("campaign.toml"))
     force: bool = option("Replace a campaign file that was edited.", default=False)
 
@@ -288,9 +291,7 @@ class ExportOptions(Command):
     urdf: Path | None = written("Write the robot's own URDF with corrected joint origins.", "URDF")
     mjcf: Path | None = written("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = written("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
-    dh_convention: Literal["standard", "craig"] = option(
-        "Convention of --dh; craig is also called modified.", default="standard"
-    )
+    dh_convention: Convention = option("Convention of --dh; craig is also called modified.", default="standard")
     ur_kinematics: Path | None = written("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
     ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
     joint_offsets: Path | None = written("Write the best joint offsets, all other geometry nominal.", "CSV")
@@ -364,11 +365,8 @@ class PlanOptions(Command):
     model: Path | None = argument(
         "MODEL", "Model file written by `fit`, to plan the next poses; or name a --robot.", default=None
     )
-    robot: Path | None = option("The robot's description, to plan the first poses.", "URDF")
-    base: str | None = option("With --robot: first link of the chain.", "LINK")
-    tip: list[str] | None = option(
-        "With --robot: last link of the chain; the markers are fixed to it. Repeat for more: each has them.", "LINK"
-    )
+    robot: Path | None = option(f"To plan the first poses. {ROBOT}", "FILE")
+    links: Links
     marker: list[str] | None = option(
         "With --robot: place of a marker in the frame of the tip, in the unit of --length; repeat for more. "
         "By default 0.1 m beside and 0.1 m in front of the tip.",
@@ -389,15 +387,13 @@ class PlanOptions(Command):
     payload_mass: float | None = option(MASS, "MASS")
 
     def check(self) -> None:
-        links = {"--robot": self.robot, "--base": self.base, "--tip": self.tip, "--marker": self.marker}
-        named = [name for name, value in links.items() if value is not None]
+        known = {"robot": self.robot, **vars(self.links), "marker": self.marker}
+        named = [f"--{name.replace('_', '-')}" for name, value in known.items() if value is not None]
         if self.model is not None and named:
             fix = "leave them out: the model knows its robot and its markers"
             raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)
-        missing = [name for name in ("--robot", "--base", "--tip") if name not in named]
-        if self.model is None and missing:
-            expected = "a MODEL, or --robot with --base and --tip"
-            raise InputError.of("what to plan for", expected=expected, got=f"no {', '.join(missing)}")
+        if self.model is None and self.robot is None:
+            raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
         if self.model is None and self.payload_mass is not None:
             fix = "leave it out: no sag under a payload is known yet"
             raise InputError.of("--payload-mass without a MODEL", fix=fix)

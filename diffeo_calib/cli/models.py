@@ -10,15 +10,18 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Robot, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Links, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.robots.urdf_elements import LARGEST_FILE
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 
@@ -30,9 +33,24 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
     return model
 
 
-def load_robot(given: Robot) -> Tree:
-    """The robot in a URDF."""
-    return load_urdf(given.robot, given.base, list(dict.fromkeys(given.tip)), given.load or ())
+def load_robot(path: Path, links: Links) -> Tree:
+    """The robot in a URDF, or in a table of Denavit-Hartenberg parameters."""
+    tips = list(dict.fromkeys(links.tip or ()))
+    if is_urdf(path):
+        if links.dh_convention is not None:
+            raise InputError.of(f"--dh-convention of a URDF, '{path}'", fix="leave it out")
+        return load_urdf(path, links.base, tips or None, links.load or ())
+    if links.base is not None or links.load or len(tips) > 1:
+        what, expected = f"--base or --load of a DH table, '{path}'", "its whole chain, or one --tip"
+        raise InputError.of(what, expected=expected, fix="leave them out, or pass a URDF")
+    return DHFile.read(path).chain(links.dh_convention, *tips)
+
+
+def is_urdf(path: Path) -> bool:
+    """Whether a file is meant as a URDF."""
+    if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
+        return True
+    return read_regular(path, "robot's description", LARGEST_FILE).lstrip()[:1] == b"<"
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:

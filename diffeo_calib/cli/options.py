@@ -164,18 +164,32 @@ class Rows:
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
+Convention = Literal["standard", "craig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links:
+    """Which part of the robot in a file."""
+
+    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
+    tip: list[str] | None = option(
+        "Last link of the chain, to which the markers are fixed, by default that of the file; for several tips once "
+        "per --position. Of a DH table the last joint.",
+        "LINK",
+    )
+    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
+    dh_convention: Convention | None = option(
+        "Convention of a DH table that does not say its own; craig is also called modified."
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """Which robot was measured."""
 
-    robot: Path = option("The robot's description.", "URDF", default=...)
-    base: str = option("First link of the chain.", "LINK", default=...)
-    tip: list[str] = option(
-        "Last link of the chain, to which the markers are fixed; for several tips once per --position.",
-        "LINK",
-        default=...,
-    )
-    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
+    robot: Path = option(ROBOT, "FILE", default=...)
+    links: Links
 
 
 @dataclass(frozen=True, kw_only=True)

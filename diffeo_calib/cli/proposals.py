@@ -19,6 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
+from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.guesses import (
     COVARIATES,
     LENS,
@@ -119,6 +120,7 @@ class RowColumns:
             if any(text.endswith(LENS) for text in self.readings):
                 why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
             sizes = self.of_boards and not self.readings[0].endswith(".yaml")
+            why += "; the lens is that of the file beside the table" * (self.of_boards and not sizes)
             why += "; width and height of the images are the least usual size that holds all corners" * sizes
             yield Choice("reading", self.readings[0] if len(self.readings) == 1 else self.readings, why)
         if self.session is not None:
@@ -166,12 +168,19 @@ def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool
 
 
 def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
-    """The files of the cameras that `images` has written beside the table, else the size of the images."""
+    """The files of the cameras beside the table, such as `images` has written, else the size of the images."""
     header, rows = read_cells(csv, sheet.sep)
     names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
     files = [f"{name}.yaml" for name in names if name]
     if len(files) > 1 and all((csv.parent / file).is_file() for file in files):
         return [f"{CORNERS}{csv.parent / file}" for file in files]
+    own, cameras = csv.with_suffix(".yaml"), list[Path]()
+    for file in [own] if own.is_file() else csv.parent.glob("*.yaml"):
+        with suppress(InputError):  # no camera
+            read_camera(file)
+            cameras.append(file)
+    if len(files) < 2 and len(cameras) == 1:
+        return [f"{CORNERS}{cameras[0]}"]
     return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from math import cos, isfinite, pi, sin
+from dataclasses import dataclass, field, replace
+from math import cos, inf, isfinite, pi, sin
 from typing import Any
 
 import torch
@@ -42,6 +42,7 @@ class DHRow:
             by convention. (S. Hayati, M. Mirmirani, "Improving the absolute positioning accuracy of robot
             manipulators", 1985.)
         parent: number of the row that this one follows, -1 for the base; by default the row before it.
+        lower, upper: limits of the joint [rad or m].
     """
 
     a: float
@@ -53,6 +54,8 @@ class DHRow:
     mimic_offset: float = 0.0
     beta: float = field(default=0.0, kw_only=True)
     parent: int | None = field(default=None, kw_only=True)
+    lower: float = field(default=-inf, kw_only=True)
+    upper: float = field(default=inf, kw_only=True)
 
 
 @outside_inference_mode
@@ -69,6 +72,9 @@ def from_dh(
 
         standard:  Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)
         craig:     Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)
+
+    Where the common normal of two nearly parallel axes is far away, makers' tables have d of hundreds of metres, which
+    the next row takes back. The frame of a joint is then moved along its axis, next to the joint before it.
 
     Args:
         rows: :class:`DHRow`, or sequences (a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]]) [m, rad].
@@ -88,7 +94,7 @@ def from_dh(
             or :class:`Tree` refuses.
 
     Warns:
-        DiffeoCalibWarning: lengths above 20 m, angles above 4 pi.
+        DiffeoCalibWarning: links above 20 m, angles above 4 pi.
     """
     if convention not in CONVENTIONS:
         raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
@@ -98,16 +104,27 @@ def from_dh(
     if not table:
         raise RobotError.of("the DH table is empty", fix="pass one row (a, alpha, d) for each joint")
     names = _names(names, len(table))
-    joints = []
-    eye = torch.eye(4, dtype=torch.float64, device="cpu")
-    for row, joint_name in zip(table, names, strict=True):  # standard: the joint moves first, in the previous frame
-        standard = convention == "standard"
-        before, after = (eye, row_transform(row)) if standard else (_about_x(row), _about_z(row))
+    parents = [index - 1 if row.parent is None else row.parent for index, row in enumerate(table)]
+    joints, links = [], {-1: torch.eye(4, dtype=torch.float64, device="cpu")}
+    for index, (row, joint_name) in enumerate(zip(table, names, strict=True)):
+        standard = convention == "standard"  # the joint moves first, in the previous frame
+        before, after = (links[-1], row_transform(row)) if standard else (_about_x(row), _about_z(row))
+        axis, place = (links[parents[index]] @ before)[:3, 2:].unbind(1)
+        along = -axis @ place
+        if float(along.abs()) > LONGEST_LINK_M:
+            slide = torch.eye(4, dtype=torch.float64, device="cpu")
+            slide[2, 3] = along
+            before, after, place = before @ slide, torch.linalg.inv(slide) @ after, place + along * axis
+        links[index] = after
+        length = max(float(place.norm()), float(after[:3, 3].norm()) * (index not in parents))
+        if length > LONGEST_LINK_M:
+            what = f"row {index} of the DH table is {length:g} m long"
+            warn_user(sentence(what, fix="divide lengths by 1000 if they are in mm"))
+        driven = {"mimic": row.mimic, "mimic_offset": row.mimic_offset}
         joints += [
-            Joint(joint_name, row.kind, before, mimic=row.mimic, mimic_offset=row.mimic_offset),  # the axis is z
+            Joint(joint_name, row.kind, before, lower=row.lower, upper=row.upper, **driven),  # the axis is z
             Joint(f"{joint_name} (link)", "fixed", after),
         ]
-    parents = [index - 1 if row.parent is None else row.parent for index, row in enumerate(table)]
     ends = [index for index in range(len(table)) if index not in parents]
     if tips is None and len(ends) == 1:
         return Chain(name, "base", "tip", joints)
@@ -169,24 +186,15 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
         raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
-    _check_units(what, numbers)
+    angle = max(numbers[1], *numbers[3:], key=abs)
+    if abs(angle) > LARGEST_ANGLE_RAD:
+        warn_user(sentence(f"an angle in {what} is {angle:g} rad", fix="convert degrees: math.radians(90)"))
     parent = index_of(row.parent)
     if row.parent is not None and (parent is None or not -1 <= parent < index):
         expected = "the number of an earlier row, or -1 for the base"
         raise RobotError.of(f"the parent in {what}", expected=expected, got=as_written(row.parent))
-    others = {"mimic": row.mimic, "mimic_offset": row.mimic_offset, "parent": parent}
-    return DHRow(*numbers[:4], kind=row.kind, beta=numbers[4], **others)
-
-
-def _check_units(what: str, row: Sequence[float]) -> None:
-    """Warn of degrees and millimetres in a, alpha, d, theta, beta."""
-    a, alpha, d, *others = row
-    angle = max(alpha, *others, key=abs)
-    if abs(angle) > LARGEST_ANGLE_RAD:
-        warn_user(sentence(f"an angle in {what} is {angle:g} rad", fix="convert degrees: math.radians(90)"))
-    length = max(a, d, key=abs)
-    if abs(length) > LONGEST_LINK_M:
-        warn_user(sentence(f"a length in {what} is {length:g} m", fix="divide by 1000 if it is in mm"))
+    a, alpha, d, theta, beta = numbers
+    return replace(row, a=a, alpha=alpha, d=d, theta=theta, beta=beta, parent=parent)
 
 
 def _about_z(row: DHRow) -> Tensor:

@@ -19,7 +19,7 @@ MOVING = frozenset(KINDS) - {"fixed"}
 
 
 @outside_inference_mode
-def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()) -> Tree:
+def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | None = None, load: Names = ()) -> Tree:
     """Read the robot between link ``base`` and link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
     Base and tips may be any links, also on different branches (from hand to hand): joints between the base and the
@@ -29,8 +29,9 @@ def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()
 
     Args:
         path: the URDF file (expand xacro files first).
-        base: name of a link.
-        tip: name of a link, or names of several; with several, ``robot(q)`` is (N, tips, 4, 4).
+        base: name of a link; by default the first one.
+        tip: name of a link, or names of several; with several, ``robot(q)`` is (N, tips, 4, 4). By default the last
+            link, if the file has a single one.
         load: names of links at which nothing is measured, but whose weight bends the robot, such as the other arm's
             hand. Gravity is constant in the link that is nearest to the root of the file on the paths: where that link
             turns in turn, name the root as a load as well.
@@ -52,8 +53,8 @@ def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()
     path = Path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     urdf = URDF.parse(content, path)
-    tips, loads = _names("tip", tip), _names("load", load)
-    paths = _Paths.between(urdf, base, tips, loads)
+    tips, loads = _names("tip", _only_end(urdf, "tip") if tip is None else tip), _names("load", load)
+    paths = _Paths.between(urdf, _only_end(urdf, "base") if base is None else base, tips, loads)
     ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
@@ -78,25 +79,28 @@ def moving_joints_below(content: bytes, links: Iterable[str]) -> list[tuple[str,
     return found
 
 
-def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
-    """First link, last link and moving joints of every path from the root of a URDF to a leaf, the longest first.
+def chains_in(path: Path) -> list[list[JointElement]]:
+    """The joints of every path from the root of a URDF to a leaf.
 
     Raises:
-        RobotError: file missing, larger than 100 MB or not a URDF.
+        RobotError: file missing, larger than 100 MB or not a URDF, one with macros, or a link with two parents.
     """
-    path = Path(path)
-    joints = URDF.parse(read_regular(path, "URDF", LARGEST_FILE, RobotError), path).joints
-    parents, children = {joint.child: joint for joint in joints}, {joint.parent for joint in joints}
-    found = []
-    for leaf in [joint.child for joint in joints if joint.child not in children]:
-        link, moving, seen = leaf, [], {leaf}
-        while link in parents and parents[link].parent not in seen:
-            joint = parents[link]
-            moving += [joint.name] * (joint.kind != "fixed" and joint.driver is None)
-            link = joint.parent
-            seen.add(link)
-        found.append((link, leaf, moving[::-1]))
-    return sorted(found, key=lambda chain: -len(chain[2]))
+    urdf = URDF.parse(read_regular(path, "URDF", LARGEST_FILE, RobotError), path)
+    urdf.check_whole("tip")
+    above, parents = _parents(urdf), {joint.parent for joint in urdf.joints}
+    leaves = [joint.child for joint in urdf.joints if joint.child not in parents]
+    return [[step.joint for step in reversed(_climb(urdf, above, leaf))] for leaf in leaves]
+
+
+def _only_end(urdf: URDF, role: str) -> str:
+    """The link before, or behind, all others."""
+    inner = {joint.parent if role == "tip" else joint.child for joint in urdf.joints}
+    found = [link for link in urdf.links if link not in inner]
+    if len(found) == 1:
+        return found[0]
+    urdf.check_whole(role)
+    got, fix = few(found, MOST_NAMES) or "none", "name the one that is meant; `diffeo-calib init` proposes it"
+    raise RobotError.of(f"`{role}` of '{urdf.path}'", expected="one link at this end", got=got, fix=fix)
 
 
 def _names(what: str, given: Names) -> tuple[str, ...]:

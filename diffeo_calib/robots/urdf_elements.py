@@ -92,13 +92,17 @@ class URDF:
         """Raise RobotError unless there is a link of this name; ``role`` is the argument that names it."""
         if name in self.links:
             return
-        if self.macros:
-            what = f"`{role}`: '{self.path}' has no link '{name}', but macros that may make it"
-            raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
+        self.check_whole(role, f" '{name}'")
         near = get_close_matches(name, self.links, n=3)
         hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
         what = f"`{role}`: '{self.path}' has no link '{name}'"
         raise RobotError.of(what, fix=f"{hint}its links are {few(self.links, MOST_NAMES) or '(none)'}")
+
+    def check_whole(self, role: str, name: str = "") -> None:
+        """Raise RobotError for macros, in a file in which no link, or none of this name, is the one for a role."""
+        if self.macros:
+            what = f"`{role}`: '{self.path}' has no link{name}, but macros that may make it"
+            raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
 
 
 def xml_of(content: bytes, path: Path) -> tuple[Any, list[str]]:

@@ -29,7 +29,6 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.robots.urdf import chains_in
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -226,7 +225,6 @@ def test_the_ur10(tmp_path: Path, command: Command) -> None:
         pytest.skip("real measurements are not here: set DIFFEO_CALIB_DATA")
     data = Path(folder) / "ipa_ur10"
     assert guess_sheet(data / "measurements_iso_cubes.csv").decimal == ","
-    assert chains_in(data / "ur10_robot.urdf")[0][1] in ("ee_link", "tool0")
     done = command("init", data / "measurements_iso_cubes.csv", data / "ur10_robot.urdf", "-o", tmp_path / "ur.toml")
     assert done.code == 0, done.err
     text = (tmp_path / "ur.toml").read_text()

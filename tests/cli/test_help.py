@@ -12,16 +12,16 @@ ROWS = (
 )
 TEXTS = {
     "fit": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load -o --output --holdout --seed --controls --duplicates "
-        "--figure --note --scales-of --report --jobs"
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
+        "--duplicates --figure --note --scales-of --report --jobs"
     ),
     "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --target --stdin --json-lines --bag --seen "
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines --bag --seen "
         "--joint-states --speed --once --candidates --page --next --accepted"
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
-    "init": "CSV URDF -o --output --force",
+    "init": "CSV ROBOT -o --output --force",
     "images": "FOLDER JOINTS --board --length -o --output --board-std --overview --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (
@@ -34,8 +34,8 @@ TEXTS = {
         "--tool-from --frame --payload-mass --tip"
     ),
     "plan": (
-        f"{UNITS} MODEL --robot --base --tip --marker -n --count -o --output --free --seed --candidates "
-        "--target-poses --measured --draw --range --tracker --facing --cone --floor --column --collisions "
+        f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
+        "--candidates --target-poses --measured --draw --range --tracker --facing --cone --floor --column --collisions "
         "--sensor --payload-mass"
     ),
     "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",

@@ -88,7 +88,7 @@ def test_former_names_of_options_are_taken_with_a_warning(words: list[object], n
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "what to plan for: expected a MODEL, or --robot with --base and --tip, got no --robot, --base, --tip"),
+        ([], "what to plan for: expected a MODEL, or --robot, got neither"),
         (["MODEL", "--base", "x"], "--base beside a MODEL"),
         (["MODEL", "--marker", "0,0,1"], "--marker beside a MODEL"),
         (["ROBOT", "--free", "base"], "--free without a MODEL"),

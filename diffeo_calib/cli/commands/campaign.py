@@ -38,13 +38,13 @@ def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
     source = measured_table(given.csv, given.rows, given.units)
     goal = parsed_length(given.target, "--target")
-    robot, played = load_robot(given.robot), _stops(source, given)
+    robot, played = load_robot(given.robot.robot, given.robot.links), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=goal)
-        live = Live(campaign, source, given.robot.tip, journal, given)
+        live = Live(campaign, source, given.robot.links.tip or list(robot.tips), journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))

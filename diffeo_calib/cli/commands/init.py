@@ -1,38 +1,73 @@
-"""`diffeo-calib init`: propose the options of `fit` for a table and a URDF as a campaign file, with reasons."""
+"""`diffeo-calib init`: propose the options of `fit` for a table and a robot as a campaign file, with reasons."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
+from itertools import product, takewhile
 from math import inf
 from os.path import relpath
 from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple, get_args
 
+from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
-from diffeo_calib.cli.options import CORNERS
+from diffeo_calib.cli.models import is_urdf, load_robot
+from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.urdf import chains_in, load_urdf
+from diffeo_calib.robots.dh_file import DHFile
+from diffeo_calib.robots.urdf import chains_in
+from diffeo_calib.robots.urdf_elements import JointElement
 
 CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
+NOT_RAISED = 1.01
+"""Ratio of residuals without and with a joint up to which the markers do not follow it."""
+FLANGES = ("flange", "tool0")
+"""Ends of the names of links to which tools are screwed."""
 COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
 """Entries that name columns."""
+
+
+class Arm(NamedTuple):
+    """The first joints of a robot, one behind the other, that the table has columns of.
+
+    Args:
+        links: the options that name them. joints: their names. ends: the link behind each. columns: of each.
+        how: these were found.
+    """
+
+    links: Links
+    joints: list[str]
+    ends: list[str]
+    columns: list[str]
+    how: str
+
+    def first(self, count: int) -> Arm:
+        """The first joints of these alone."""
+        links = replace(self.links, tip=[self.ends[count - 1]])
+        return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how)
 
 
 def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     csv, output = given.csv, given.output
+    if csv.is_dir():
+        read_cells(csv, ",")  # says why not
     sheet = guess_sheet(csv)
     try:
-        choices = list(_choices(csv, given.urdf, output, sheet))
+        choices = list(_choices(csv, given.robot, output, sheet))
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -51,43 +86,152 @@ def run(given: InitOptions) -> None:
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
 
 
-def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
-    folder = output.parent
+def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
+    folder, urdf = output.parent, is_urdf(robot)
     yield Choice("csv", relpath(csv, folder), "; ".join(["the table", *sheet.notes]))
-    yield Choice("robot", relpath(urdf, folder), "the URDF")
-    base, tip, (joints, how), why = _chain(urdf, sheet)
-    rows = proposals.rows_in(csv, sheet, joints)
-    tips = proposals.tips_of(rows.markers, [leaf for _, leaf, _ in chains_in(urdf)])
-    chain = load_urdf(urdf, base, list(dict.fromkeys(tips)) or tip)
-    if tips:
-        joints, how = guess_joints(sheet.numbers, chain.joint_names) or (joints, how)
-    yield Choice("base", base, why)
-    leaf = "a leaf below it; the markers are fixed to it or to a link before it"
-    yield Choice("tip", tips, "leaves after which the columns are named") if tips else Choice("tip", tip, leaf)
-    yield Choice("joints", ",".join(joints), how)
-    yield from rows.entries()
+    yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
+    arm, why, seen, units = _explained(csv, robot, sheet)
+    if urdf:
+        yield Choice("base", arm.links.base or "", "root of the URDF")
+    if arm.links.dh_convention is not None:
+        yield Choice("dh-convention", arm.links.dh_convention, "the convention with which it explains the rows")
+    if seen.tips:
+        yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
+    elif arm.links.tip is not None:
+        yield Choice("tip", arm.links.tip[0], why)
+    yield Choice("joints", ",".join(seen.joints), arm.how)
+    for choice in seen.rows.entries():
+        yield choice._replace(value=_from_folder(choice.value, folder))
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
-    units = list(_units(seen, sheet))
     yield from units
-    found = {choice.name: str(choice.value) for choice in units}
-    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    if "rotation" not in found:
-        yield from proposals.beside(replace(seen, table=table), sheet)
+    if not any(choice.name == "rotation" for choice in units):
+        yield from proposals.beside(replace(seen, table=_format(units, sheet)), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
-def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
-    """First and last link of the longest chain whose joints the table has, and the columns of its joints."""
-    chains = chains_in(urdf)
-    for base, tip, joints in chains:
-        found = guess_joints(sheet.numbers, joints) if joints else None
-        if found is not None:
-            return base, tip, found, f"root of the URDF; {len(joints)} joints to {tip}"
-    expected = " or ".join(few(joints, 20) for _, _, joints in chains[:3]) or "a robot with joints"
-    raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
+def _from_folder(value: Any, folder: Path) -> Any:
+    """Files of cameras in texts of --reading relative to the folder of the campaign."""
+    if isinstance(value, list):
+        return [_from_folder(text, folder) for text in value]
+    named = isinstance(value, str) and value.startswith(CORNERS) and value.endswith(".yaml")
+    return CORNERS + relpath(value.removeprefix(CORNERS), folder) if named else value
+
+
+def _format(units: list[Choice], sheet: Sheet) -> TableFormat:
+    """The format of positions and joints in these units."""
+    found = {choice.name: choice.value for choice in units}
+    on_tool = "camera-on-tool" in found and "rotation" not in found
+    return TableFormat(str(found["length"]), str(found["angle"]), sheet.sep, sheet.decimal, camera_on_tool=on_tool)
+
+
+class Explained(NamedTuple):
+    """Rows that a robot explains: its joints and why the tip is behind these, the table, and its units."""
+
+    arm: Arm
+    why: str
+    seen: Source
+    units: list[Choice]
+
+
+def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
+    """The joints, or the convention, that explain the rows; InputError if none do, or several."""
+    found, refused = dict[tuple[str | None, ...], Explained](), list[InputError]()
+    leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
+    for arm in _arms(robot, sheet):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # `fit` warns of the right reading
+                rows = proposals.rows_in(csv, sheet, arm.columns)
+                tips = proposals.tips_of(rows.markers, leaves)
+                chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
+                joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
+                columns = arm.columns if joints is None else joints[0]
+                seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+                one = _with_tip(robot, Explained(arm, "", seen, list(_units(seen, sheet))), sheet)
+                found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
+        except InputError as error:
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    if len(found) == 1:
+        return next(iter(found.values()))
+    best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, sheet)))
+    alike = {key: one.seen.residual(_format(best.units, sheet)) for key, one in found.items()}
+    if not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
+        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {best.seen.size(size)}" for key, size in alike.items())
+        fix = "say the convention in the file, by a line such as `# craig`" if best.arm.links.dh_convention else ""
+        fix = fix or "name the columns after the joints of the arm"
+        raise InputError.of(
+            f"the joints of '{robot}'", expected="some that explain the rows far better", got=got, fix=fix
+        )
+    return best
+
+
+def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
+    """As many joints of a robot as the table has columns of; of a DH table in the conventions that it may have."""
+    whole = list[tuple[Links, list[str], list[str]]]()
+    if is_urdf(robot):
+        for path in (paths := chains_in(robot)):
+            moving = [joint for joint in path if joint.kind != "fixed" and joint.driver is None]
+            ends = [_end_behind(path, joint, paths) for joint in moving]
+            whole.append((Links(base=path[0].parent), [joint.name for joint in moving], ends))
+    else:
+        table = DHFile.read(robot)
+        ways = [None] if table.convention else get_args(Convention)
+        whole += [(Links(dh_convention=way), table.names, table.names) for way in ways]
+    arms = list[Arm]()
+    for options, joints, ends in whole:
+        for count in range(len(joints), 0, -1):
+            guessed = guess_joints(sheet.numbers, joints[:count])
+            series = guessed is not None and guessed[1].startswith("numbered")
+            if guessed is not None and (2 * count > len(joints) or not series):  # a short series may be of anything
+                arm = Arm(options, joints[:count], ends, guessed[0], guessed[1])
+                arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
+                break
+    if not arms:
+        longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
+        expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
+        raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20))
+    most = max(len(arm.joints) for arm in arms)
+    return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
+
+
+def _with_tip(robot: Path, found: Explained, sheet: Sheet) -> Explained:
+    """The same without joints at the end that no marker follows, and why."""
+    arm, _, seen, units = found
+    table, left_out = _format(units, sheet), list[str]()
+    q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
+    moved = (q.amax(0) - q.amin(0)).tolist()
+    while len(arm.joints) > 1 and not seen.tips:
+        count = len(arm.joints) - 1
+        shorter, last = arm.first(count), arm.joints[count]
+        without = replace(seen, robot=load_robot(robot, shorter.links), joints=shorter.columns)
+        if moved[count] < UNMOVED_JOINT_RANGE:
+            left_out.append(f"{last} hardly moves in the table")
+        else:
+            an_arm_s = moved[count] > median(moved) / 2  # its axis may run through the marker
+            size, residual = seen.residual(table), without.residual(table)
+            if size > proposals.LARGEST_RESIDUAL or residual > size * (1 / CLEAR_RATIO if an_arm_s else NOT_RAISED):
+                break
+            words = f"with {last} the residual of the nominal robot is {seen.size(size)}, without it"
+            left_out.append(f"{words} {seen.size(residual)}")
+        arm, seen = shorter, without
+    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+    return Explained(arm, why, seen, list(_units(seen, sheet)) if left_out else units)
+
+
+def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
+    """The flange, by usual names, or the link of a joint; behind joints that follow this or earlier ones."""
+    place = path.index(joint)
+    above = {one.name for one in path[: place + 1]}
+    behind = [joint, *takewhile(lambda one: one.kind == "fixed" or one.driver in above, path[place + 1 :])]
+    links = [[one.child for one in behind if one.kind != "fixed"][-1]]
+    fixed = {one.child: one.parent for path in paths for one in path if one.kind == "fixed"}
+    for link in links:
+        links += [child for child, parent in fixed.items() if parent == link]
+    return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])
 
 
 def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:

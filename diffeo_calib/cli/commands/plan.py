@@ -16,7 +16,7 @@ from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_fo
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
+from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
@@ -27,7 +27,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 SENSORS = {
@@ -104,9 +103,8 @@ def run(given: PlanOptions) -> None:
 
 
 def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
-    """A chain in a URDF, and the markers (P, 3) on its tip, m."""
-    tips = given.tip or []
-    robot = load_urdf(given.robot or "", given.base or "", tips[0] if len(tips) == 1 else tips)
+    """The robot, and the markers (P, 3) on its tip, m."""
+    robot = load_robot(given.robot or Path(), given.links)
     numbers = [_numbers("--marker", text, (3,)) for text in given.marker or ()]
     places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
     return robot, places / table.per_metre if numbers else places

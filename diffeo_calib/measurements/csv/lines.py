@@ -168,6 +168,9 @@ class CsvLines:
     def _read(self) -> Iterator[None]:
         try:
             yield
+        except IsADirectoryError as error:
+            fix = f"of images of a board run `diffeo-calib images '{self.path}' JOINTS.csv ...` first, and pass its table"
+            raise MeasurementError.of(f"'{self.path}' is a folder", expected="a table", fix=fix) from error
         except OSError as error:
             what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
             fix = f"check the name and the folder (searched from '{Path.cwd()}')"

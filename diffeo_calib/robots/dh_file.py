@@ -1,0 +1,209 @@
+"""Robots from files with a Denavit-Hartenberg table: a header, and one line for each joint.
+
+Columns have their usual names, in any order: a, alpha, d, theta, and if there are any beta, offset (of the joint's
+value), joint (its name), type, min, max and convention. The unit of a column stands behind its name: `d [mm]`,
+`alpha_deg`. Columns a_{i-1} and alpha_{i-1} are Craig's. Cells may be multiples of pi and may name the joint's value:
+`pi/2`, `q1 - 90`.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan, pi
+from pathlib import Path
+
+from diffeo_calib.common.errors import RobotError, few, shown
+from diffeo_calib.common.files import read_regular
+from diffeo_calib.robots.dh import LARGEST_ANGLE_RAD, LONGEST_LINK_M, DHRow, from_dh
+from diffeo_calib.robots.tree import Chain
+
+NUMBERS = {
+    "a": "a linklength",
+    "alpha": "alpha linktwist twist",
+    "d": "d linkoffset",
+    "theta": "theta jointangle thetaoffset",
+    "beta": "beta",
+    "offset": "offset jointoffset qoffset",
+    "lower": "min lower qmin lowerlimit minlimit",
+    "upper": "max upper qmax upperlimit maxlimit",
+}
+"""Number of a joint -> letters of its column's name."""
+TEXTS = {
+    "name": "joint name jointname frame link axis i no",
+    "kind": "type kind jointtype sigma",
+    "unread": "mimic x y z roll pitch yaw",
+}
+KINDS = {
+    **dict.fromkeys(("revolute", "r", "rotary", "rotational", "continuous", "0"), "revolute"),
+    **dict.fromkeys(("prismatic", "p", "linear", "slide", "translational", "1"), "prismatic"),
+}
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "rad": 1.0, "deg": pi / 180}
+WORDS = {"standard": "standard|classic|classical|distal|sdh", "craig": "craig|modified|proximal|mdh"}
+"""Words of a file, or of its name, that say its convention."""
+PLAIN = str.maketrans({"α": "alpha", "θ": "theta", "ϑ": "theta", "β": "beta", "π": "pi", "−": "-", "$": "", "\\": ""})
+UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
+INDEXED = re.compile(r"(a|alpha|d|theta)[_ ]*[{(]?\s*(?:[ijkn](\s*-\s*1)?|(prev)\w*)\s*[})]?")
+VALUE = re.compile(r"(?:^|\+)(?:q|theta|th|d)_?\{?\d*\}?\*?(?=$|[+-])")
+"""The joint's own value in a cell, such as q1 or theta_1*."""
+TURNS = re.compile(r"([+-]?[\d.]*)\*?pi(?:/([\d.]+))?")
+RIGHT_ANGLE_RAD = 0.02
+"""Largest difference from 90 or 180 degrees that is one of calibration."""
+LARGEST_FILE = 1_000_000
+"""Bytes of a file that no table has."""
+
+
+@dataclass(frozen=True)
+class DHFile:
+    """The table of a file.
+
+    Args:
+        path: the file. names: of the joints. rows: their parameters [m, rad].
+        convention: "standard" or "craig", empty if the file does not say it. units: how it was read, in words.
+    """
+
+    path: Path
+    names: list[str]
+    rows: list[DHRow]
+    convention: str
+    units: str
+
+    @classmethod
+    def read(cls, path: Path) -> DHFile:
+        """Read a file; columns that say no unit have that with which the robot has the size of one, and right angles.
+
+        Raises:
+            RobotError: no such table, a cell that is no number, no unit of angles, or two conventions.
+        """
+        text = read_regular(path, "robot's description", LARGEST_FILE, RobotError).decode("utf-8-sig", "replace")
+        lines = [line.strip() for line in text.translate(PLAIN).splitlines() if line.strip()]
+        header, cells = _cells(path, lines)
+        rows = [dict(zip(map(_what, header), row, strict=True)) for row in cells]
+        said = {way for way, words in WORDS.items() if _mention([path.stem, *lines], words)}
+        said |= {"craig" for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
+        if len(said) > 1:
+            raise RobotError.of(
+                f"'{path}' names two conventions", expected="standard or craig (modified), in one place"
+            )
+        own = {_what(cell): found[1].lower().replace("°", "deg") for cell in header if (found := UNIT.search(cell))}
+        units = _likely_units(rows) | own
+        if not units["alpha"] or not units["theta"]:
+            what, fix = f"the unit of angles of '{path}'", "write it into the header: alpha [deg], theta [deg]"
+            raise RobotError.of(what, expected="rad or deg", got="numbers that may be either", fix=fix)
+        names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
+        names = [f"joint_{name}" if name.isdecimal() else name for name in names]
+        table = [_row(row, units, f"joint '{shown(name)}' of '{path}'") for name, row in zip(names, rows, strict=True)]
+        words = f"lengths in {units['a']}, angles in {units['alpha']}" + ", by size" * (not {"a", "alpha"} <= set(own))
+        return cls(path, names, table, "".join(said), words)
+
+    def chain(self, convention: str | None = None, tip: str | None = None) -> Chain:
+        """The robot from "base" to "tip", or up to a joint.
+
+        Args:
+            convention: "standard" or "craig", if the file does not say it. tip: name of the joint.
+
+        Raises:
+            RobotError: no convention, or another one than that of the file; no such joint.
+        """
+        way = self.convention or convention
+        if not way or convention not in (None, way):
+            what, fix = (
+                f"the convention of '{self.path}'",
+                "say it by --dh-convention; `init` finds the one that fits",
+            )
+            got = f"{convention}, but the file says {way}" if way else "neither in the file"
+            raise RobotError.of(what, expected="standard or craig (modified)", got=got, fix=fix)
+        if tip not in (None, *self.names):
+            raise RobotError.of(
+                f"--tip of '{self.path}'", expected=f"one of {few(self.names, 20)}", got=shown(str(tip))
+            )
+        count = len(self.names) if tip is None else self.names.index(tip) + 1
+        found = from_dh(self.rows[:count], way, self.names[:count], self.path.stem)
+        return Chain(found.name, found.base, tip or found.tip, found.joints)
+
+
+def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """The header and the cells of every joint."""
+    seps = [max(",;\t|", key=line.count) for line in lines]
+    headers = [_split(line.lstrip("#%/ "), sep) for line, sep in zip(lines, seps, strict=True)]
+    top = next((k for k, header in enumerate(headers) if {"a", "alpha", "d"} <= set(map(_what, header))), None)
+    if top is None:
+        what, expected = f"'{path}' is no DH table", "a header with the columns a, alpha, d and theta"
+        raise RobotError.of(what, expected=expected, got=shown(lines[0] if lines else ""), fix="or pass a URDF")
+    cells = [_split(line, seps[top]) for line in lines[top + 1 :] if line[0] not in "#%/"]
+    names = [name for name in map(_what, headers[top]) if name not in ("", "unread")]
+    bad = next((row for row in cells if len(row) != len(headers[top])), names if len(set(names)) < len(names) else None)
+    if bad is not None or not cells:
+        expected, got = f"rows of {len(headers[top])} cells, one column of each kind", few(bad or ["no row"], 20)
+        raise RobotError.of(f"the DH table '{path}'", expected=expected, got=got, fix="repair this line")
+    return headers[top], cells
+
+
+def _split(line: str, sep: str) -> list[str]:
+    """Cells of a line; with white space between them where there is no separator."""
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=sep))] if sep in line else line.split()
+
+
+def _bare(cell: str) -> str:
+    """A name in the header without its unit."""
+    return UNIT.sub("", cell, count=1).strip().lower()
+
+
+def _what(cell: str) -> str:
+    """What a column holds; empty if its name is unknown."""
+    indexed = INDEXED.fullmatch(_bare(cell))
+    letters = indexed[1] if indexed else re.sub(r"[^a-z]", "", _bare(cell))
+    return next((what for what, names in (NUMBERS | TEXTS).items() if letters in names.split()), "")
+
+
+def _mention(lines: Sequence[str], words: str) -> bool:
+    return any(re.search(f"(?<![a-z])({words})(?![a-z])", line, re.IGNORECASE) for line in lines)
+
+
+def _likely_units(rows: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """Units by size, empty if unclear: no link is longer than 20 m, and most axes are at right angles."""
+    a, d, alpha, theta = ([_number(row, what) for row in rows] for what in ("a", "d", "alpha", "theta"))
+    length = max(map(abs, a))
+    if length <= LONGEST_LINK_M:  # of axes that are nearly parallel two d of hundreds of metres nearly cancel
+        length = min(abs(sum(d)), max(map(abs, d)))
+    angles, texts = [*map(abs, alpha + theta)], " ".join(row.get(k, "") for row in rows for k in ("alpha", "theta"))
+    angle = "" if any(angles) else "rad"
+    if "pi" in texts or any(abs(value - turn) < RIGHT_ANGLE_RAD for value in angles for turn in (pi / 2, pi)):
+        angle = "rad"
+    if "°" in texts or max(angles) > LARGEST_ANGLE_RAD:
+        angle = "deg"
+    lengths = dict.fromkeys(("a", "d"), "mm" if length > LONGEST_LINK_M else "m")
+    return lengths | dict.fromkeys(("alpha", "theta", "beta"), angle)
+
+
+def _row(row: Mapping[str, str], units: Mapping[str, str], what: str) -> DHRow:
+    """The parameters of a joint."""
+    slides = VALUE.search(row["d"].lower()) is not None
+    kind = KINDS.get(row.get("kind", "").lower() or ("p" if slides else "r"), "")
+    value = {name: _number(row, name) for name in NUMBERS}
+    wrong = [name for name in NUMBERS if not isfinite(value[name])] + ["kind"] * (not kind)
+    wrong += ["unread"] * bool(row.get("unread"))  # of tables that `export` writes
+    if wrong:
+        expected, got = "a revolute or prismatic joint, numbers and multiples of pi", f"{wrong[0]} {row[wrong[0]]!r}"
+        raise RobotError.of(what, expected=expected, got=shown(got), fix="correct the cell, or pass a URDF")
+    own = "d" if kind == "prismatic" else "theta"
+    for name in NUMBERS:
+        value[name] *= 1.0 if "pi" in row.get(name, "") else UNITS[units.get(name) or units[own]]
+    value[own] += value.pop("offset")
+    value |= {name: end for name, end in (("lower", -inf), ("upper", inf)) if not row.get(name)}
+    return DHRow(kind=kind, **value)
+
+
+def _number(row: Mapping[str, str], what: str) -> float:
+    """A cell in its own unit, a multiple of pi in rad, without the joint's own value; 0 where it is empty, or NaN."""
+    text = re.sub(r"[\s°]", "", row.get(what, "").lower()).replace(",", ".")
+    text = VALUE.sub("", "" if text == "-" else text)
+    try:
+        if (turns := TURNS.fullmatch(text)) is None:
+            return float(text or 0)
+        factor = f"{turns[1]}1" if turns[1] in ("", "+", "-") else turns[1]
+        return float(factor) * pi / float(turns[2] or 1)
+    except (ValueError, ZeroDivisionError):
+        return nan
