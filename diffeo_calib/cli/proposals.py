@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf
+from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
-from diffeo_calib.calibration.identification.registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cli.guesses import (
     COVARIATES,
@@ -31,14 +32,16 @@ from diffeo_calib.cli.guesses import (
     guess_positions,
     guess_readings,
     guess_rotation,
+    guess_sheet,
     guess_sockets,
 )
-from diffeo_calib.cli.options import CORNERS, Rows
+from diffeo_calib.cli.options import CORNERS, Places, Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import number, read_cells
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.poses import numbers_of
@@ -141,7 +144,9 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
+        common = next((name for name in sheet.header if name not in joints), "COLUMN")
+        fix = f"if they are in another file: --places FILE --by {common}; "
+        fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
     named = [name for name in sheet.header if name not in joints]
@@ -197,6 +202,35 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
         yield from deviations(source)
 
 
+def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
+    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
+    if given.places is None:
+        return csv, []
+    joints, places = guess_sheet(csv), guess_sheet(given.places)
+    common = [name for name in joints.header if name in places.header]
+    if given.by is None and not common:
+        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
+        raise InputError.of(
+            "--places without --by", expected=expected, got=got, fix="add one, such as numbers of poses"
+        )
+    by = given.by or common[0]
+    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
+    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
+    return found, entries
+
+
+def marker(source: Source, sheet: Sheet) -> Choice | None:
+    """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
+    for length, angle in product(("mm", "m"), ("deg", "rad")) if len(source.rows.markers) == 1 else ():
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            data = source.read(TableFormat(length, angle, sheet.sep, sheet.decimal))
+            found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
+            if found is not None:
+                return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
+    return None
+
+
 @dataclass(frozen=True)
 class Source:
     """A table whose joints, positions and units are known."""
@@ -208,6 +242,7 @@ class Source:
     table: TableFormat
     numbers: tuple[str, ...]
     tips: Sequence[str] = ()
+    marker: str | None = None
 
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
@@ -216,7 +251,7 @@ class Source:
         sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
         markers = self.rows.markers or None
         session = self.rows.session if markers else None
-        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds)
+        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds, marker=self.marker)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
         data: Any = read_observations(self.csv, columns, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)

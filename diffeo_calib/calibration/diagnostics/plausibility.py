@@ -8,7 +8,12 @@ from typing import Any
 import torch
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.likely_mistakes import NO_MISTAKE_FOUND, likely_mistake, refuse_or_warn
+from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    NO_MISTAKE_FOUND,
+    likely_mistake,
+    refuse_or_warn,
+    refuse_unnamed_markers,
+)
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
@@ -97,6 +102,7 @@ def registered(robot: Tree, data: Measurements) -> Identification:
     """
     registration, inliers = register_inliers(robot, data)
     _check_motion(robot, data)
+    refuse_unnamed_markers(registration.geometry, data)
     check_row_order(robot, data, registration)
     registration = with_large_offsets(data, registration, inliers)
     _check_registration(robot, data, registration)
@@ -119,6 +125,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
     Warns:
         DiffeoCalibWarning: none does.
     """
+    refuse_unnamed_markers(identification.geometry, data)
     size, typical = spread(data.points), _typical(identification, data)
     angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
     if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:

@@ -23,15 +23,30 @@ from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
+COLUMNS = (
+    "joints",
+    "position",
+    "marker",
+    "socket",
+    "rotation",
+    "std",
+    "session",
+    "payload",
+    "reading",
+    "time",
+    "temperature",
+    "by",
+)
 """Entries that name columns."""
 
 
 def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
-    csv, output = given.csv, given.output
+    output = given.output
+    csv, joined = proposals.with_places(given.csv, given.places, output.parent)
     sheet = guess_sheet(csv)
-    choices = list(_choices(csv, given.urdf, output, sheet))
+    choices = [Choice("csv", relpath(given.csv, output.parent), "the table"), *joined]
+    choices += _choices(csv, given.urdf, output, sheet)
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -50,7 +65,6 @@ def run(given: InitOptions) -> None:
 
 def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
     folder = output.parent
-    yield Choice("csv", relpath(csv, folder), "the table")
     yield Choice("robot", relpath(urdf, folder), "the URDF")
     base, tip, (joints, how), why = _chain(urdf, sheet)
     rows = proposals.rows_in(csv, sheet, joints)
@@ -66,6 +80,9 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+    if (marker := proposals.marker(seen, sheet)) is not None:
+        yield marker
+        seen = replace(seen, marker=str(marker.value))
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
