@@ -210,9 +210,8 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
     common = [name for name in joints.header if name in places.header]
     if given.by is None and not common:
         expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
-        raise InputError.of(
-            "--places without --by", expected=expected, got=got, fix="add one, such as numbers of poses"
-        )
+        fix = "add one, such as the number of the pose"
+        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
     by = given.by or common[0]
     found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
     entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]

@@ -24,9 +24,10 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
-from diffeo_calib.measurements.csv.joined import joined_file, read_joinable
+from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -72,6 +73,8 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     check_place(rows)
     table = with_rows(table_format(units), rows)
     csv = with_places(csv, rows, table)
+    if isinstance(csv, JoinedFile):
+        say(csv.sentence)
     readings = readings_columns(rows.reading or (), rows)
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     how = duplicates, rows.session, sockets, readings, rows.marker
@@ -85,9 +88,7 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
         raise InputError.of("--places and --by belong together", fix=fix)
     if rows.places is None or rows.by is None:
         return csv
-    found = joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
-    say(found.sentence)
-    return found
+    return joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
 
 
 def check_place(rows: Rows) -> None:
@@ -141,9 +142,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    sep, header = table_format(units).sep, set[str]()
-    for path in (csv, rows.places):
-        header |= set() if path is None else set(read_joinable(path, rows.by, sep).header)
+    table = table_format(units)
+    header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import marker_column
-from diffeo_calib.calibration.diagnostics.plausibility import registered
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.writing import write_rows
@@ -64,4 +64,4 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
 def test_rows_of_several_markers_are_no_fit(tmp_path: Path) -> None:
     data = table(tmp_path / "t.csv", POINTS[torch.arange(ROWS), LABELS], LABELS)
     with pytest.raises(MeasurementError, match=r"column 'target' takes 3 values.* name the column: --marker target"):
-        registered(ARM.nominal, data)
+        check_identification(data, register(ARM.nominal, data.q, data.points))

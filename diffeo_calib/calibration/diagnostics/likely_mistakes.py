@@ -211,14 +211,6 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
     return None
 
 
-def refuse_unnamed_markers(geometry: Geometry, data: Measurements) -> None:
-    """Raise MeasurementError if a column that was not read names which of several markers a row shows."""
-    found = marker_column(geometry, data)
-    if found is not None:
-        what = f"column '{shown(found[0])}' takes {found[1]}: which marker does a row show"
-        raise MeasurementError.of(what, fix=f"name the column: --marker {shown(found[0])} (in Python `marker`)")
-
-
 def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:
     """Warn if a joint below the given tip moves the markers, judged by its column in the table.
 

@@ -11,8 +11,8 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     NO_MISTAKE_FOUND,
     likely_mistake,
+    marker_column,
     refuse_or_warn,
-    refuse_unnamed_markers,
 )
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
@@ -24,7 +24,7 @@ from diffeo_calib.calibration.identification.registration import (
     with_large_offsets,
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
@@ -102,7 +102,6 @@ def registered(robot: Tree, data: Measurements) -> Identification:
     """
     registration, inliers = register_inliers(robot, data)
     _check_motion(robot, data)
-    refuse_unnamed_markers(registration.geometry, data)
     check_row_order(robot, data, registration)
     registration = with_large_offsets(data, registration, inliers)
     _check_registration(robot, data, registration)
@@ -120,12 +119,15 @@ def check_identification(data: Measurements, identification: Identification) -> 
     """Doubt measurements that even a full geometric calibration leaves unexplained.
 
     Raises:
-        MeasurementError: another reading explains them far better.
+        MeasurementError: another reading explains them far better, or several markers that a column names.
 
     Warns:
         DiffeoCalibWarning: none does.
     """
-    refuse_unnamed_markers(identification.geometry, data)
+    if (several := marker_column(identification.geometry, data)) is not None:
+        column, words = shown(several[0]), several[1]
+        fix = f"name the column: --marker {column} (in Python `marker`)"
+        raise MeasurementError.of(f"column '{column}' takes {words}: which marker does a row show", fix=fix)
     size, typical = spread(data.points), _typical(identification, data)
     angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
     if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:

@@ -23,20 +23,8 @@ from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
-COLUMNS = (
-    "joints",
-    "position",
-    "marker",
-    "socket",
-    "rotation",
-    "std",
-    "session",
-    "payload",
-    "reading",
-    "time",
-    "temperature",
-    "by",
-)
+COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "session", "payload", "reading", "by")
+COLUMNS = (*COLUMNS, "time", "temperature")
 """Entries that name columns."""
 
 

@@ -49,18 +49,26 @@ class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):
         return super().__str__()
 
 
-class JoinableTable(NamedTuple):
-    """A file to be joined: its columns, its lines, and the place of the common column."""
+class _Table(NamedTuple):
+    """A file to be joined: its columns, its lines, and the texts of the common column, with the place of that."""
 
     path: Path
     header: list[str]
     lines: Lines
     by: int
+    keys: list[str]
 
-    @property
-    def keys(self) -> list[str]:
-        """The texts of the common column."""
-        return [cells[self.by] for _, cells in self.lines]
+    @classmethod
+    def read(cls, path: Path, by: str, sep: str) -> _Table:
+        """The file, with the first usual separator with which it has the common column."""
+        for mark in (sep, *SEPARATORS):
+            with suppress(MeasurementError):
+                header, lines = read_cells(path, mark)
+                if by in header:
+                    at = header.index(by)
+                    return cls(path, header, lines, at, [cells[at] for _, cells in lines])
+        header, lines = read_cells(path, sep)
+        return cls(path, header, lines, find_columns(path, header, [by], sep)[0], [])  # says what is wrong
 
     def numbers(self, place: int, decimal: str) -> Array:
         """(N,) of a column, NaN for cells that are no numbers."""
@@ -81,55 +89,33 @@ def joined_file(
     Raises:
         MeasurementError: a file that cannot be read or lacks the column, several partners of a line, or no pair.
     """
-    tables = table, measured = read_joinable(joints, by, sep), read_joinable(places, by, sep)
-    recorded, times, common = (
-        False,
-        [own.numbers(own.by, decimal) for own in tables],
-        {*table.keys} & {*measured.keys} - {""},
-    )
+    tables = table, measured = _Table.read(joints, by, sep), _Table.read(places, by, sep)
+    times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
     if 2 * len(common) < len({*measured.keys}) and all(len(own) > 1 and np.isfinite(own).all() for own in times):
         recorded = all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times)
         pairs, how = _at_stops(tables, times, decimal) if recorded else _by_time(*times)
     else:
         known = {text: [row for row, own in enumerate(table.keys) if own == text] for text in common}
         pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in known.get(text, ())], f"by {by}"
+    left = [sorted({*range(len(own.lines))} - {pair[k] for pair in pairs}) for k, own in enumerate(tables)]
+    without = [
+        f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"
+        for own, rows in zip(tables, left, strict=True)
+        if rows
+    ]
     if not pairs:
-        got = "; ".join(f"{few(own.keys, 3)} in {own.path.name}" for own in tables)
         fix = "name a column with the same texts in both files, or with times of one clock"
-        raise MeasurementError.of(f"--by {shown(by)}", expected="values that both files have", got=got, fix=fix)
+        expected, got = "values that both files have", " and ".join(without)
+        raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
     found = JoinedFile(tempfile.mkdtemp(prefix="diffeo_calib_"), places.name)
     weakref.finalize(found, shutil.rmtree, os.path.dirname(found), ignore_errors=True)
     with found.open("w", encoding="utf-8", newline="") as file:
         _write(file, tables, pairs, sep)
-    without = (
-        []
-        if recorded
-        else [
-            f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"
-            for k, own in enumerate(tables)
-            if (rows := sorted({*range(len(own.lines))} - {pair[k] for pair in pairs}))
-        ]
-    )
     found.words = f"{places}, joined with {joints}"
     found.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
     found.sentence += f"; lines without a partner: {' and '.join(without)}" * bool(without)
     return found
-
-
-def read_joinable(path: Path, by: str | None, sep: str) -> JoinableTable:
-    """A file, with the first usual separator with which it has the common column ``by`` if it is to be joined.
-
-    Raises:
-        MeasurementError: a file that cannot be read, or has no such column.
-    """
-    for mark in dict.fromkeys((sep, *SEPARATORS)) if by is not None else ():
-        with suppress(MeasurementError):
-            header, lines = read_cells(path, mark)
-            if by in header:
-                return JoinableTable(path, header, lines, header.index(by))
-    header, lines = read_cells(path, sep)
-    return JoinableTable(path, header, lines, 0 if by is None else find_columns(path, header, [by], sep)[0])
 
 
 def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
@@ -141,7 +127,7 @@ def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
     return pairs, f"by the nearest time, at most {max((apart[pair] for pair in pairs), default=0.0):.3g} apart"
 
 
-def _at_stops(tables: Sequence[JoinableTable], times: Sequence[Array], decimal: str) -> tuple[Pairs, str]:
+def _at_stops(tables: Sequence[_Table], times: Sequence[Array], decimal: str) -> tuple[Pairs, str]:
     """The lines in the middle of every stop of two recordings, whose clocks may differ; and in words."""
     joints, seen = (_motion(own, at, decimal) for own, at in zip(tables, times, strict=True))
     found, offset = stops(joints, Recording(seen.times, seen.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
@@ -153,7 +139,7 @@ def _nearest(times: Array, time: float) -> int:
     return int(np.abs(times - time).argmin())
 
 
-def _motion(own: JoinableTable, times: Array, decimal: str) -> Recording:
+def _motion(own: _Table, times: Array, decimal: str) -> Recording:
     """The columns of numbers that do not always grow, in units of what is no motion; the clearest ones first."""
     columns = [own.numbers(place, decimal) for place in range(len(own.header)) if place != own.by]
     moving = [v for v in columns if np.isfinite(v).all() and np.ptp(v) > 0.0 and not (np.diff(v) > 0).all()]
@@ -164,7 +150,7 @@ def _motion(own: JoinableTable, times: Array, decimal: str) -> Recording:
     return Recording(times, np.stack(sorted(scaled, key=np.ptp, reverse=True), axis=1))
 
 
-def _refuse_several(tables: Sequence[JoinableTable], pairs: Pairs, *, several: bool) -> None:
+def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) -> None:
     """MeasurementError for a line that has several partners; ``several``: lines of joints may."""
     for k in (1,) if several else (0, 1):
         row, count = Counter(pair[k] for pair in pairs).most_common(1)[0]
@@ -177,7 +163,7 @@ def _refuse_several(tables: Sequence[JoinableTable], pairs: Pairs, *, several: b
             raise MeasurementError.of(what, expected="one partner", got=got, fix=fix)
 
 
-def _write(file: TextIO, tables: Sequence[JoinableTable], pairs: Pairs, sep: str) -> None:
+def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> None:
     """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
     table, measured = tables
     kept = [place for place in range(len(measured.header)) if place != measured.by]

@@ -187,10 +187,8 @@ class PositionColumns(SensorColumns):
             if not first or pose != poses[first[-1]] or texts[line] in texts[first[-1] : line]:
                 first.append(line)
             numbers.append(len(first) - 1)
-        of_rows, places = (
-            rows.of(torch.tensor(first, dtype=torch.int64, device=HOST)),
-            [names.index(text) for text in texts],
-        )
+        places = [names.index(text) for text in texts]
+        of_rows = rows.of(torch.tensor(first, dtype=torch.int64, device=HOST))
         for key in {"points", "std"} & {*values}:
             own = torch.full((len(first), len(names), 3), torch.nan, dtype=torch.float64, device=HOST)
             own[numbers, places] = values[key][:, 0]

@@ -61,13 +61,8 @@ class TableOrigin:
         one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
         one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
         one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints)}
-        one |= {
-            **table.covariates,
-            "session": self.session,
-            "marker": self.marker,
-            "sep": table.sep,
-            "decimal": table.decimal,
-        }
+        one |= {**table.covariates, "session": self.session, "marker": self.marker}
+        one |= {"sep": table.sep, "decimal": table.decimal}
         words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
         return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
 
