@@ -206,13 +206,15 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
     """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
     if given.places is None:
         return csv, []
-    joints, places = guess_sheet(csv), guess_sheet(given.places)
-    common = [name for name in joints.header if name in places.header]
+    joints, places = sheets = guess_sheet(csv), guess_sheet(given.places)
+    tables = [read_cells(path, sheet.sep) for path, sheet in zip((csv, given.places), sheets, strict=True)]
+    texts = [{name: {cells[k] for _, cells in rows} for k, name in enumerate(header)} for header, rows in tables]
+    common = {name: len(own & texts[1][name]) for name, own in texts[0].items() if name in texts[1]}
     if given.by is None and not common:
         expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
         fix = "add one, such as the number of the pose"
         raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
-    by = given.by or common[0]
+    by = given.by or max(common, key=lambda name: common[name])
     found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
     entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
     return found, entries

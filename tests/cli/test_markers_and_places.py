@@ -10,8 +10,10 @@ import torch
 from command_bank import Command
 from torch.testing import assert_close
 
-from diffeo_calib.cli.options import Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Places, Rows, StoredUnits, Units
+from diffeo_calib.cli.proposals import with_places
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
+from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -98,6 +100,17 @@ def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command) ->
     ):
         assert words in done.out
     assert command("fit", tmp_path / "c.toml", "--position", "x").err.endswith("expected three columns X,Y,Z, got x\n")
+
+
+def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> None:
+    (tmp_path / "j.csv").write_text("time,robot,pose,a\n0.5,R1,7,1\n1.5,R1,8,2\n")
+    (tmp_path / "p.csv").write_text("pose;time;robot;x\n8;0.4;R1;1\n7;1.6;R1;2\n")
+    path, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
+    assert [entry.value for entry in entries] == ["p.csv", "pose"]
+    assert read_cells(path, ",")[1] == [
+        (2, ["1.5", "R1", "8", "2", "0.4", "R1", "1"]),
+        (3, ["0.5", "R1", "7", "1", "1.6", "R1", "2"]),
+    ]
 
 
 def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
