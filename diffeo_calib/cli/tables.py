@@ -77,8 +77,9 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
         say(csv.sentence)
     readings = readings_columns(rows.reading or (), rows)
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
-    how = duplicates, rows.session, sockets, readings, rows.marker
-    return MeasuredTable(csv, units.joints, rows.position or [], table, *how)
+    triples = _position_triples(rows.position or []) or None
+    columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
+    return MeasuredTable(csv, units.joints, columns, table, duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -213,24 +214,15 @@ class MeasuredTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        position: X,Y,Z of every marker.
-        table: the format.
-        duplicates: what to do with exactly repeated rows.
-        session: column that names the set-up of every row; None if there was one.
-        sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
-        readings: columns of each kind of reading, beside positions and sockets if these are named.
-        marker: column that names the marker of every line.
+        columns: those of what was measured, whose joints are those of the robot that reads them.
+        table: the format. duplicates: what to do with exactly repeated rows.
     """
 
     csv: Path
     joints: str | None
-    position: list[str]
+    columns: TableColumns
     table: TableFormat
     duplicates: str = "keep"
-    session: str | None = None
-    sockets: SocketColumns | None = None
-    readings: tuple[Any, ...] = ()
-    marker: str | None = None
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """Read the rows of a robot, under the names of its own joints.
@@ -241,16 +233,15 @@ class MeasuredTable:
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
         """
-        triples = _position_triples(self.position) or None
-        several = len(tips) > 1 and self.sockets is None and not self.readings
+        given, triples = self.columns, self.columns.position
+        several = len(tips) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
-        kinds, names = robot.kinds, joint_columns(self.joints, robot)
-        session = self.session if triples or not self.readings else None  # of readings it names their devices
-        columns = TableColumns(names, triples, self.sockets, self.readings, session, kinds, marker=self.marker)
+        session = given.session if triples or not given.readings else None  # of readings it names their devices
+        columns = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
         data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
-        if self.marker is not None and self.marker != data.origin.marker:  # later tables have the same order
+        if given.marker is not None and given.marker != data.origin.marker:  # later tables have the same order
             say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
             add_to_command_line(["--marker", data.origin.marker])
         data = data.with_joint_names(robot.joint_names)
@@ -258,7 +249,7 @@ class MeasuredTable:
 
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
-        if count and self.session is None:
+        if count and self.columns.session is None:
             what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
             fix = "name the column of the set-ups (--session), or leave these rows out"
             warn_user(sentence(f"{what}its frame", fix=fix))

@@ -97,11 +97,10 @@ def joined_file(
     else:
         known = {text: [row for row, own in enumerate(table.keys) if own == text] for text in common}
         pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in known.get(text, ())], f"by {by}"
-    left = [sorted({*range(len(own.lines))} - {pair[k] for pair in pairs}) for k, own in enumerate(tables)]
     without = [
         f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"
-        for own, rows in zip(tables, left, strict=True)
-        if rows
+        for k, own in enumerate(tables)
+        if (rows := sorted({*range(len(own.keys))} - {pair[k] for pair in pairs}))
     ]
     if not pairs:
         fix = "name a column with the same texts in both files, or with times of one clock"
