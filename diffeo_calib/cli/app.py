@@ -20,11 +20,8 @@ from diffeo_calib.cli import campaign
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import printable, warn_user
 
-MASS, FREEDOM = {"--payload": "--payload-mass"}, {"--marker": "--marker-freedom"}
-RENAMED = {
-    **{"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}},
-    **{"recalibrate": FREEDOM, "compare": FREEDOM},
-}
+MASS = {"--payload": "--payload-mass"}
+RENAMED = {"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}}
 """Command -> former names of options, which had another meaning in other commands, and their names."""
 
 DECLARED: dict[str, dict[str, Any]] = {}

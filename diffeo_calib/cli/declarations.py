@@ -22,6 +22,7 @@ from diffeo_calib.cli.options import (
     Frame,
     Length,
     Links,
+    Places,
     Robot,
     Rows,
     StoredUnits,
@@ -99,8 +100,7 @@ class CampaignOptions(Command):
     rows: Rows
     target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
-        "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.",
-        default=False,
+        "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.", default=False
     )
     json_lines: bool = option(
         "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
@@ -184,6 +184,7 @@ class InitOptions(Command):
 
     csv: Path = argument("CSV", CSV)
     robot: Path = argument("ROBOT", ROBOT)
+    places: Places
     output: Path = output("Campaign file to write.", "TOML", Path("campaign.toml"))
     force: bool = option("Replace a campaign file that was edited.", default=False)
 

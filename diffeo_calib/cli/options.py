@@ -102,7 +102,21 @@ class Units(StoredUnits):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rows:
+class Places:
+    """Measured places in a file of their own."""
+
+    places: Path | None = option(
+        "File with the measured places where CSV has the joint values alone; --by joins both.", "FILE"
+    )
+    by: str | None = option(
+        "Column of both files: texts that are the same in both, such as names of poses; or times, of which the nearest "
+        "within half a step belong together. Of two recordings the clocks may differ, and every stop becomes a row.",
+        "COLUMN",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
 
     position: list[str] | None = option(
@@ -122,6 +136,12 @@ class Rows:
         "lengths and principal point of a camera), or corners=CAMERA.yaml (=WIDTH,HEIGHT of an unknown camera) for "
         "corners of a printed board. --session names the fixed point, plane or camera of each row.",
         "KIND=COLUMN",
+    )
+    marker: str | None = option(
+        "Column that names which marker a line holds, where each has the position of one (not with --rotation or "
+        "several --position, nor for readings and images). Lines with the same joint values that follow each other are "
+        "one row. With names in order where a model has them: COLUMN=A,B,...",
+        "COLUMN",
     )
     session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
     remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
@@ -250,10 +270,9 @@ class Candidates:
 class ChangeTests:
     """How changes since an old fit are tested."""
 
-    marker: Literal["evidence", "same", "moved", "other"] = option(
+    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
         "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
         "other ones (anywhere); by default the rows decide.",
-        names=("--marker-freedom",),
         default="evidence",
     )
     seed: int = option("Seed of the tests for changes.", min=0, max=LARGEST_SEED, default=0)

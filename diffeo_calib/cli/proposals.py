@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import inf
+from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
-from diffeo_calib.calibration.identification.registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.guesses import (
@@ -32,14 +33,16 @@ from diffeo_calib.cli.guesses import (
     guess_positions,
     guess_readings,
     guess_rotation,
+    guess_sheet,
     guess_sockets,
 )
-from diffeo_calib.cli.options import CORNERS, Rows
+from diffeo_calib.cli.options import CORNERS, Places, Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
@@ -146,7 +149,9 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
+        common = next((name for name in sheet.header if name not in joints), "COLUMN")
+        fix = f"if they are in another file: --places FILE --by {common}; "
+        fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
     named = [name for name in sheet.header if name not in joints]
@@ -209,6 +214,36 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
         yield from deviations(source)
 
 
+def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
+    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
+    if given.places is None:
+        return csv, []
+    joints, places = sheets = guess_sheet(csv), guess_sheet(given.places)
+    tables = [read_cells(path, sheet.sep) for path, sheet in zip((csv, given.places), sheets, strict=True)]
+    texts = [{name: {cells[k] for _, cells in rows} for k, name in enumerate(header)} for header, rows in tables]
+    common = {name: len(own & texts[1][name]) for name, own in texts[0].items() if name in texts[1]}
+    if given.by is None and not common:
+        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
+        fix = "add one, such as the number of the pose"
+        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
+    by = given.by or max(common, key=lambda name: common[name])
+    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
+    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
+    return found, entries
+
+
+def marker(source: Source, sheet: Sheet) -> Choice | None:
+    """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
+    for length, angle in product(("mm", "m"), ("deg", "rad")) if len(source.rows.markers) == 1 else ():
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            data = source.read(TableFormat(length, angle, sheet.sep, sheet.decimal))
+            found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
+            if found is not None:
+                return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
+    return None
+
+
 @dataclass(frozen=True)
 class Source:
     """A table whose joints, positions and units are known."""
@@ -220,6 +255,7 @@ class Source:
     table: TableFormat
     numbers: tuple[str, ...]
     tips: Sequence[str] = ()
+    marker: Choice | None = None
 
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
@@ -228,7 +264,8 @@ class Source:
         sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
         markers = self.rows.markers or None
         session = self.rows.session if markers else None
-        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds)
+        marker = None if self.marker is None else str(self.marker.value)
+        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds, marker=marker)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
         data: Any = read_observations(self.csv, columns, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)

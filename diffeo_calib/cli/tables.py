@@ -26,6 +26,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
+from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
@@ -68,12 +69,27 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
 
 
 def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
-    """The table that options describe; exact repeats are kept by default."""
+    """The table that options describe, joined of two files if these do; exact repeats are kept by default."""
     check_place(rows)
     table = with_rows(table_format(units), rows)
+    csv = with_places(csv, rows, table)
+    if isinstance(csv, JoinedFile):
+        say(csv.sentence)
     readings = readings_columns(rows.reading or (), rows)
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
-    return MeasuredTable(csv, units.joints, rows.position or [], table, duplicates, rows.session, sockets, readings)
+    triples = _position_triples(rows.position or []) or None
+    columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
+    return MeasuredTable(csv, units.joints, columns, table, duplicates)
+
+
+def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
+    """The table, joined with that of the measured places if there is one."""
+    if (rows.places is None) != (rows.by is None):
+        fix = "--places names the file of the measured places, --by a column of both files"
+        raise InputError.of("--places and --by belong together", fix=fix)
+    if rows.places is None or rows.by is None:
+        return csv
+    return joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
 
 
 def check_place(rows: Rows) -> None:
@@ -109,7 +125,12 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
         stored = shlex.split(command) if groups else []
         known = {option: texts for group in groups for option, texts in _read_options(stored, group).items()}
         typed = {f"--{name.replace('_', '-')}" for name, value in (vars(own) | vars(units)).items() if value}
+        typed |= {"--places"} | ({"--by"} if own.places is None else set())  # of the file of the fit
         words = [word for option, texts in known.items() if option not in typed for word in texts]
+        if own.marker is not None and "=" not in own.marker:
+            order = _read_options(shlex.split(command), Rows).get("--marker", [""])[-1].partition("=")[1:]
+            own = replace(own, marker=own.marker + "".join(order))
+            add_to_command_line(["--marker", own.marker])
         completed = _completed(own, words), _completed(units, words)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
@@ -122,7 +143,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    header = set(read_cells(csv, table_format(units).sep)[0])
+    table = table_format(units)
+    header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}
@@ -163,7 +185,7 @@ def _read_options(words: Sequence[str], group: type[StoredUnits] | type[Rows]) -
         if option in options:
             flag = options[option][1] is bool
             own = [option] if flag else [option, value if equal else words[place + 1]]
-            found.setdefault(option, []).extend(own)
+            found[option] = [*found.get(option, ()), *own] if has(options[option][1], list) else own
     return found
 
 
@@ -192,23 +214,15 @@ class MeasuredTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        position: X,Y,Z of every marker.
-        table: the format.
-        duplicates: what to do with exactly repeated rows.
-        session: column that names the set-up of every row; None if there was one.
-        sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
-        readings: columns of each kind of reading, beside positions and sockets if these are named.
-        growing: whether rows will be added.
+        columns: those of what was measured, whose joints are those of the robot that reads them.
+        table: the format. duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
     """
 
     csv: Path
     joints: str | None
-    position: list[str]
+    columns: TableColumns
     table: TableFormat
     duplicates: str = "keep"
-    session: str | None = None
-    sockets: SocketColumns | None = None
-    readings: tuple[Any, ...] = ()
     growing: bool = False
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
@@ -220,21 +234,23 @@ class MeasuredTable:
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
         """
-        triples = _position_triples(self.position) or None
-        several = len(tips) > 1 and self.sockets is None and not self.readings
+        given, triples = self.columns, self.columns.position
+        several = len(tips) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
-        kinds, names = robot.kinds, joint_columns(self.joints, robot)
-        session = self.session if triples or not self.readings else None  # of readings it names their devices
-        columns = TableColumns(names, triples, self.sockets, self.readings, session, kinds)
+        session = given.session if triples or not given.readings else None  # of readings it names their devices
+        columns = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
         data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates, growing=self.growing)
+        if given.marker is not None and given.marker != data.origin.marker:  # later tables have the same order
+            say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
+            add_to_command_line(["--marker", data.origin.marker])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
-        if count and self.session is None:
+        if count and self.columns.session is None:
             what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
             fix = "name the column of the set-ups (--session), or leave these rows out"
             warn_user(sentence(f"{what}its frame", fix=fix))

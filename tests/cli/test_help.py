@@ -8,7 +8,7 @@ from command_bank import Command
 UNITS = "--length --angle --joint-length --joints --sep --decimal"
 ROWS = (
     "--position --rotation --convention --rotation-angle --lever --camera-on-tool --std --rotation-std --socket "
-    "--distance --distance-std --reading --session --remounted --payload --time --temperature"
+    "--distance --distance-std --reading --session --remounted --payload --time --temperature --marker --places --by"
 )
 TEXTS = {
     "fit": (
@@ -21,7 +21,7 @@ TEXTS = {
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
-    "init": "CSV ROBOT -o --output --force",
+    "init": "CSV ROBOT --places --by -o --output --force",
     "images": "FOLDER JOINTS --board --length -o --output --board-std --overview --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (

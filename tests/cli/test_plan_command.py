@@ -75,7 +75,6 @@ def test_next_poses_and_poses_to_measure_again(
     [
         (["plan", "--target=p.csv", "-n", 3, "-o", "o.csv"], "--target-poses"),
         (["correct", "m", "p.csv", "--payload", 5, "-o", "o.csv"], "--payload-mass"),
-        (["recalibrate", "m", "p.csv", "--marker", "same", "-o", "o"], "--marker-freedom"),
     ],
 )
 def test_former_names_of_options_are_taken_with_a_warning(words: list[object], name: str, command: Command) -> None:

@@ -102,6 +102,9 @@ DECISIVE_READING = 0.02
 """Part of the residual below which no other mistake is tried."""
 REGISTERED_ROWS = 60
 """Largest number of rows that are registered for a reading."""
+MOST_MARKERS, MARKER_ROWS, MARKERS_LEFT = 12, 4, 0.5
+"""Most texts of a column that are names of markers, fewest rows of each, and the largest part of the RMS error that a
+marker for each may leave, of that with one marker and of that with a place of the device for each."""
 JOINT_BELOW_TIP = 0.8
 """Part of the residual that a joint below the tip must leave to be warned about; a joint that does not move the markers
 leaves more than all of it."""

@@ -33,7 +33,9 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
@@ -182,6 +184,31 @@ def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwis
 def residual_of(robot: Tree, data: Measurements) -> float:
     """Median residual of a registration of the measurements as they are, m; infinite if the rows are too few."""
     return _residual(Reading.of(robot, data))
+
+
+def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | None:
+    """A column that was not read, and why it names which of several markers a row shows; None without one.
+
+    Rows of another marker than that of the geometry are off by a constant in the frame of its tip.
+    """
+    if data.markers > 1 or not isinstance(data.origin, TableOrigin) or bool(data.points.isnan().any()):
+        return None
+    error, columns = (data.points - geometry.points(data.q))[:, 0].cpu(), data.origin.columns
+    in_tip = (geometry.marker_poses(data.q)[:, 0, :3, :3].cpu().mT @ error[:, :, None])[:, :, 0]
+    for column, texts in data.origin.texts(data.line_numbers).items():
+        names = list(dict.fromkeys(texts))
+        rows = torch.tensor([[text == name for name in names] for text in texts], dtype=error.dtype, device=HOST)
+        few_rows = not 1 < len(names) <= gates.MOST_MARKERS or float(rows.sum(0).min()) < gates.MARKER_ROWS
+        if few_rows or "" in names or column in {*columns.names, data.origin.session}:
+            continue
+        means = [rows.mT @ own / rows.sum(0)[:, None] for own in (in_tip, error)]
+        left = [float((own - rows @ mean).norm()) for own, mean in zip((in_tip, error), means, strict=True)]
+        alone, freedom = float(in_tip.norm()), ((len(texts) - 1) / (len(texts) - len(names))) ** 0.5
+        if left[0] * freedom < gates.MARKERS_LEFT * min(alone, left[1] * freedom):
+            jump, per_row = 1e3 * float(torch.cdist(means[0], means[0]).max()), 1e3 / len(texts) ** 0.5
+            words = f"{len(names)} values between which the points jump by {jump:.3g} mm on the tool (RMS error "
+            return column, f"{words}{alone * per_row:.3g} mm, and {left[0] * per_row:.3g} mm without these jumps)"
+    return None
 
 
 def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:

@@ -8,7 +8,12 @@ from typing import Any
 import torch
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.likely_mistakes import NO_MISTAKE_FOUND, likely_mistake, refuse_or_warn
+from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    NO_MISTAKE_FOUND,
+    likely_mistake,
+    marker_column,
+    refuse_or_warn,
+)
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
@@ -19,7 +24,7 @@ from diffeo_calib.calibration.identification.registration import (
     with_large_offsets,
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
@@ -114,11 +119,15 @@ def check_identification(data: Measurements, identification: Identification) -> 
     """Doubt measurements that even a full geometric calibration leaves unexplained.
 
     Raises:
-        MeasurementError: another reading explains them far better.
+        MeasurementError: another reading explains them far better, or several markers that a column names.
 
     Warns:
         DiffeoCalibWarning: none does.
     """
+    if (several := marker_column(identification.geometry, data)) is not None:
+        column, words = shown(several[0]), several[1]
+        fix = f"name the column: --marker {column} (in Python `marker`)"
+        raise MeasurementError.of(f"column '{column}' takes {words}: which marker does a row show", fix=fix)
     size, typical = spread(data.points), _typical(identification, data)
     angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
     if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:

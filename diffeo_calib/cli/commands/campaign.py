@@ -36,6 +36,9 @@ LOOK_SECONDS = 0.1
 
 def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
+    if given.rows.by is not None or given.rows.marker is not None:
+        fix = "give every row in one line of one file, with columns for each marker"
+        raise InputError.of("--places or --marker, of a table that grows line by line", fix=fix)
     source = measured_table(given.csv, given.rows, given.units)
     goal = parsed_length(given.target, "--target")
     robot, played = load_robot(given.robot.robot, given.robot.links), _stops(source, given)

@@ -38,7 +38,8 @@ def run(given: CompareOptions) -> None:
     model = load_kinematics(given.old)
     source = table_of(model, given.other, given.rows, given.units)
     say(*provenance_lines(model), *another_date_lines(model))
-    found = compare(model, source.read(model.robot), level=given.level, **vars(given.tests))
+    how = {"marker": given.tests.marker_freedom, "seed": given.tests.seed}
+    found = compare(model, source.read(model.robot), level=given.level, **how)
     if not isinstance(found, Comparison):
         return None
     record.add(

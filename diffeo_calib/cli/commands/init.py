@@ -36,7 +36,8 @@ NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload", "reading", "time", "temperature")
+COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "session", "payload", "reading", "by")
+COLUMNS = (*COLUMNS, "time", "temperature")
 """Entries that name columns."""
 
 
@@ -62,12 +63,14 @@ class Arm(NamedTuple):
 
 def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
-    csv, output = given.csv, given.output
-    if csv.is_dir():
-        read_cells(csv, ",")  # says why not
+    output = given.output
+    if given.csv.is_dir():
+        read_cells(given.csv, ",")  # says why not
+    csv, joined = proposals.with_places(given.csv, given.places, output.parent)
     sheet = guess_sheet(csv)
+    choices = [Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])), *joined]
     try:
-        choices = list(_choices(csv, given.robot, output, sheet))
+        choices += _choices(csv, given.robot, output, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -88,7 +91,6 @@ def run(given: InitOptions) -> None:
 
 def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
     folder, urdf = output.parent, is_urdf(robot)
-    yield Choice("csv", relpath(csv, folder), "; ".join(["the table", *sheet.notes]))
     yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
     arm, why, seen, units = _explained(csv, robot, sheet)
     if urdf:
@@ -102,6 +104,8 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
     yield Choice("joints", ",".join(seen.joints), arm.how)
     for choice in seen.rows.entries():
         yield choice._replace(value=_from_folder(choice.value, folder))
+    if seen.marker is not None:
+        yield seen.marker
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     yield from units
@@ -149,6 +153,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
                 columns = arm.columns if joints is None else joints[0]
                 seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+                seen = replace(seen, marker=proposals.marker(seen, sheet))
                 one = _with_tip(robot, Explained(arm, "", seen, list(_units(seen, sheet))), sheet)
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:

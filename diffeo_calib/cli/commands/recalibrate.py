@@ -26,7 +26,8 @@ def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model, output = load_kinematics(given.old), given.output
     source = table_of(model, given.csv, given.rows, given.units)
-    how: Any = {**vars(given.tests), "drift": given.drift, "note": given.note}
+    tests = given.tests
+    how: Any = {"marker": tests.marker_freedom, "seed": tests.seed, "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with exit_on_interrupt(), progress_bar() as progress:
         data = source.read(model.robot)

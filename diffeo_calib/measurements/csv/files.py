@@ -60,7 +60,8 @@ def read_observations(
         else :class:`Observations`. Rows are in the order of the file.
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    file, sensors, numbers = Path(path), columns.sensors, columns.numeric(table)
+    file = path if isinstance(path, Path) else Path(path)
+    sensors, numbers = columns.sensors, columns.numeric(table)
     with TableFile(file, numbers, columns.texts) as whole:
         rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
     tables = []
@@ -74,7 +75,8 @@ def read_observations(
     sha256 = file_sha256(file)
     data = data.with_file_sha256(sha256)
     if rows.alone and columns.position is not None:
-        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session))
+        marker = columns.marker and f"{columns.marker.partition('=')[0]}={','.join(data.marker_names)}"
+        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session, marker))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
@@ -139,6 +141,7 @@ def read_measurements(
     camera_on_tool: bool = False,
     session: str | None = None,
     remounted: bool = False,
+    marker: str | None = None,
     socket: Sequence[str] | str | None = None,
     distances: Distances | None = None,
     distance_std: float | None = None,
@@ -181,6 +184,9 @@ def read_measurements(
         time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
         remounted: whether the markers were mounted anew between these instead, see there.
+        marker: name of a column that names the marker of every line, where each has the position of one. Lines with the
+            same joint values that follow each other are one row. Markers are in the order in which they appear, or, for
+            rows of a model, in the one that ``"COLUMN=A,B,C"`` gives.
         camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
             deviations are along its axes; see :meth:`Measurements.from_poses`.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
@@ -208,7 +214,7 @@ def read_measurements(
     tip = None if not on or isinstance(on, str) else on[-1]
     names = (socket,) if isinstance(socket, str) else tuple(socket or ())
     sockets = None if socket is None else SocketColumns(names, distances, distance_std, tip)
-    columns = TableColumns(robot, position, sockets, session=session, kinds=kinds, on=on)
+    columns = TableColumns(robot, position, sockets, session=session, kinds=kinds, on=on, marker=marker)
     return _read(path, columns, table, duplicates, joints)
 
 

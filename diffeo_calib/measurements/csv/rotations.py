@@ -84,8 +84,11 @@ def with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) 
 
 
 def numeric_table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tensor]]:
-    """How the measurements were read, and all numeric columns of their file; None if there is none any more."""
-    if not isinstance(data.origin, TableOrigin):
+    """How the measurements were read, and all numeric columns of their file; None if there is none any more.
+
+    None too where a row is made of several lines.
+    """
+    if not isinstance(data.origin, TableOrigin) or data.origin.marker is not None:
         return None, {}
     table = data.origin.numeric_columns(data.line_numbers)
     return (data.origin.columns, table) if table else (None, {})

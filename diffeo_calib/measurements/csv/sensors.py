@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import (
@@ -120,27 +120,36 @@ class PositionColumns(SensorColumns):
 
     Args:
         session: column that names the set-up of every row; None for one. on: tips of the markers or frames.
+        marker: column that names the marker of every line, "=" and the names in order where a model has them; None if
+            every line has the positions of all.
     """
 
     session: str | None = None
     on: Sequence[str] | None = None
+    marker: str | None = None
     word = "a position"
 
     @property
     def texts(self) -> Mapping[str, bool]:
         """See :class:`SensorColumns`."""
-        return {} if self.session is None else {self.session: True}
+        own = self.session, self.marker and self.marker.partition("=")[0]
+        return {name: True for name in own if name is not None}
 
     def filled(self, rows: FileRows) -> Tensor:
         """See :class:`SensorColumns`."""
         return ~rows.values["points"].isnan().flatten(1).all(1)
 
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """See :class:`SensorColumns`: the first line of every row."""
+        return self._with_markers(rows)[0]
+
     def table(self, rows: FileRows) -> Measurements:
         """See :class:`SensorColumns`; MeasurementError for numbers that do not form a rotation."""
+        rows, names = self._with_markers(rows)
         values, columns, table = rows.values, rows.columns, rows.columns.table
         std, turns = values.get("std"), values.get("rotation_std")
         if table.convention is None:
-            data = Measurements(values["q"], values["points"], columns.joints, std=std, doubt=False)
+            data = Measurements(values["q"], values["points"], columns.joints, names, std=std, doubt=False)
         else:
             single = len(columns.triples) == 1
             data = Measurements.from_poses(
@@ -154,6 +163,35 @@ class PositionColumns(SensorColumns):
                 doubt=False,
             )
         return data.with_tips(self.on).with_sessions(rows.devices(self.session, "a name"), remounted=table.remounted)
+
+    def _with_markers(self, rows: FileRows) -> tuple[FileRows, Sequence[str] | None]:
+        """The rows, with (N, P, 3) of all markers, NaN where hidden, if a column names that of every line; these names.
+
+        A row holds lines that follow each other with the same joint values, payload and session, of different markers.
+        """
+        if self.marker is None:
+            return rows, None
+        column, _, given = self.marker.partition("=")
+        texts, values = rows.named(column, "the name of a marker"), rows.values
+        names = given.split(",") if given else list(dict.fromkeys(texts))
+        if unknown := [name for name in dict.fromkeys(texts) if name not in names]:
+            what, fix = f"file '{rows.path}', column '{column}'", "remove their lines, or calibrate with all of them"
+            raise MeasurementError.of(what, expected=f"markers of the model: {few(names)}", got=few(unknown), fix=fix)
+        sessions = [""] * len(texts) if self.session is None else rows.texts[self.session]
+        loads = values.get("payload", torch.zeros(len(texts), dtype=torch.float64, device=HOST))
+        poses = list(zip(values["q"].tolist(), loads.tolist(), sessions, strict=True))
+        numbers, first = list[int](), list[int]()
+        for line, pose in enumerate(poses):
+            if not first or pose != poses[first[-1]] or texts[line] in texts[first[-1] : line]:
+                first.append(line)
+            numbers.append(len(first) - 1)
+        places = [names.index(text) for text in texts]
+        of_rows = rows.of(torch.tensor(first, dtype=torch.int64, device=HOST))
+        for key in {"points", "std"} & {*values}:
+            own = torch.full((len(first), len(names), 3), torch.nan, dtype=torch.float64, device=HOST)
+            own[numbers, places] = values[key][:, 0]
+            of_rows = of_rows._replace(values={**of_rows.values, key: own})
+        return of_rows, names
 
     def written(self, part: Any, table: TableFormat) -> Written:
         """See :class:`SensorColumns`."""
@@ -277,12 +315,8 @@ class ReadingColumns(SensorColumns):
 
     def table(self, rows: FileRows) -> Readings:
         """See :class:`SensorColumns`."""
-        q, joints, table, (own,) = (
-            rows.values["q"],
-            rows.columns.joints,
-            rows.columns.table,
-            self.reported(rows.columns.table),
-        )
+        q, joints, table = rows.values["q"], rows.columns.joints, rows.columns.table
+        (own,) = self.reported(table)
         if isinstance(self.values, tuple):
             seen = rows.values[own.values]
         else:
@@ -319,6 +353,7 @@ class TableColumns:
         session: column that names the set-up of the device that measures positions or poses.
         kinds: kind of every joint; by default those of the robot, or all revolute.
         on: names of the tips that carry the markers or frames, for a robot with several tips.
+        marker: column that names the marker of every line, as of :class:`PositionColumns`.
     """
 
     joints: Any
@@ -328,11 +363,12 @@ class TableColumns:
     session: str | None = None
     kinds: Sequence[str] | None = None
     on: Sequence[str] | None = None
+    marker: str | None = None
 
     @property
     def sensors(self) -> list[SensorColumns]:
         """The columns of each kind."""
-        positions = [] if self.position is None else [PositionColumns(self.session, self.on)]
+        positions = [] if self.position is None else [PositionColumns(self.session, self.on, self.marker)]
         return [*positions, *([] if self.sockets is None else [self.sockets]), *self.readings]
 
     @property
@@ -360,6 +396,10 @@ class TableColumns:
             raise MeasurementError.of("`position` is missing", fix=fix)
         if table.remounted and self.session is None:
             raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
+        several = len(self.sensors) > 1 or self.position is None or len(position_triples(self.position)) > 1
+        if self.marker is not None and (several or table.rotation is not None):
+            expected = "one position (x, y, z) in every line, and neither rotations, sockets nor readings"
+            raise MeasurementError.of(f"`marker` ({shown(self.marker)})", expected=expected, fix="leave it out")
         if self.position is not None:
             return
         given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}

@@ -38,13 +38,14 @@ class TableOrigin:
         path: the file.
         columns: which of its columns were read, and how.
         sha256: of its content; None for what can be read only once, such as a pipe.
-        session: column of the set-ups.
+        session: column of the set-ups. marker: column that names the marker of each line, "=" and the names in order.
     """
 
     path: Path
     columns: Columns
     sha256: str | None
     session: str | None = None
+    marker: str | None = None
 
     @property
     def options(self) -> str:
@@ -60,16 +61,26 @@ class TableOrigin:
         one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
         one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
         one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints)}
-        one |= {**table.covariates, "session": self.session, "sep": table.sep, "decimal": table.decimal}
+        one |= {**table.covariates, "session": self.session, "marker": self.marker}
+        one |= {"sep": table.sep, "decimal": table.decimal}
         words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
         return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
 
     def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.
 
-        Empty if the file has changed since, or is gone. With ``gaps`` some cells may be empty or not a number, and are
-        NaN then.
+        With ``gaps`` some cells may be empty or not a number, and are NaN then.
         """
+        found = {}
+        for name, cells in self.texts(line_numbers).items():
+            values = numbers_in(cells, self.columns.table.decimal)
+            there = [value for value in values if not gaps or value is None or not math.isnan(value)]
+            if there and all(value is not None and math.isfinite(value) for value in there):
+                found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
+        return found
+
+    def texts(self, line_numbers: Tensor) -> dict[str, list[str]]:
+        """The cells of all columns in these lines (N,); empty if the file has changed since, or is gone."""
         try:
             if self.sha256 is None or file_sha256(self.path) != self.sha256:
                 return {}
@@ -78,15 +89,7 @@ class TableOrigin:
             return {}
         cells = dict(rows)
         wanted = [cells.get(line, []) for line in line_numbers.tolist()]
-        if not all(wanted):
-            return {}
-        found = {}
-        for name, texts in zip(header, zip(*wanted, strict=True), strict=True):
-            values = numbers_in(texts, self.columns.table.decimal)
-            there = [value for value in values if not gaps or value is None or not math.isnan(value)]
-            if there and all(value is not None and math.isfinite(value) for value in there):
-                found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
-        return found
+        return {name: [row[place] for row in wanted] for place, name in enumerate(header)} if all(wanted) else {}
 
 
 FEW_ROWS = 2000

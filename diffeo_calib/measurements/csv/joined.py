@@ -1,0 +1,179 @@
+"""Two tables as one: joint values in one file, measured places in another, joined by a column that both have.
+
+The joined lines have the numbers of those of the places. Texts of the column are compared as they are. Numbers that
+mostly differ are times: the nearest belong together if they are within half a step. Of two recordings, whose clocks may
+differ, every stop becomes a line, see :mod:`~diffeo_calib.measurements.stops`.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import pathlib
+import shutil
+import tempfile
+import weakref
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+import numpy as np
+
+from diffeo_calib.common.errors import MeasurementError, few, shown
+from diffeo_calib.measurements.csv.cells import find_columns, number
+from diffeo_calib.measurements.csv.lines import Lines, read_cells
+from diffeo_calib.measurements.stops import LIMITS, NOISE_FACTOR, Recording, StopLimits, stops
+
+SEPARATORS = (",", ";", "\t", "|")
+MOVED = 1e-3
+"""Part of the range of a column by which it moves at least, unless its noise is larger."""
+Array = np.ndarray
+Pairs = list[tuple[int, int]]
+"""Numbers of lines with the same joint values: of the joints and of the places."""
+
+
+class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
+    """A file of joined lines, which lasts as long as this path to it; messages name the files that were joined.
+
+    Attributes:
+        words: these files. sentence: how many lines are joined, and which have no partner.
+    """
+
+    words = sentence = ""
+
+    def __str__(self) -> str:
+        return self.words or super().__str__()
+
+    def __fspath__(self) -> str:
+        return super().__str__()
+
+
+class _Table(NamedTuple):
+    """A file to be joined: its columns, its lines, and the texts of the common column, with the place of that."""
+
+    path: Path
+    header: list[str]
+    lines: Lines
+    by: int
+    keys: list[str]
+
+    @classmethod
+    def read(cls, path: Path, by: str, sep: str) -> _Table:
+        """The file, with the first usual separator with which it has the common column."""
+        for mark in (sep, *SEPARATORS):
+            with suppress(MeasurementError):
+                header, lines = read_cells(path, mark)
+                if by in header:
+                    at = header.index(by)
+                    return cls(path, header, lines, at, [cells[at] for _, cells in lines])
+        header, lines = read_cells(path, sep)
+        return cls(path, header, lines, find_columns(path, header, [by], sep)[0], [])  # says what is wrong
+
+    def numbers(self, place: int, decimal: str) -> Array:
+        """(N,) of a column, NaN for cells that are no numbers."""
+        values = [number(cells[place], decimal) for _, cells in self.lines]
+        return np.array([np.nan if value is None else value for value in values])
+
+
+def joined_file(
+    joints: Path, places: Path, by: str, sep: str = ",", decimal: str = ".", *, several: bool = False
+) -> JoinedFile:
+    """A file with the columns of both tables.
+
+    Args:
+        joints, places: the files. by: the common column. sep, decimal: as of a table; another usual separator of one of
+            the files is found by the common column.
+        several: whether lines of places may share their joint values, as those of markers do.
+
+    Raises:
+        MeasurementError: a file that cannot be read or lacks the column, several partners of a line, or no pair.
+    """
+    tables = table, measured = _Table.read(joints, by, sep), _Table.read(places, by, sep)
+    times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
+    if 2 * len(common) < len({*measured.keys}) and all(len(own) > 1 and np.isfinite(own).all() for own in times):
+        recorded = all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times)
+        pairs, how = _at_stops(tables, times, decimal) if recorded else _by_time(*times)
+    else:
+        known = {text: [row for row, own in enumerate(table.keys) if own == text] for text in common}
+        pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in known.get(text, ())], f"by {by}"
+    without = [
+        f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"
+        for k, own in enumerate(tables)
+        if (rows := sorted({*range(len(own.keys))} - {pair[k] for pair in pairs}))
+    ]
+    if not pairs:
+        fix = "name a column with the same texts in both files, or with times of one clock"
+        expected, got = "values that both files have", " and ".join(without)
+        raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
+    _refuse_several(tables, pairs, several=several)
+    found = JoinedFile(tempfile.mkdtemp(prefix="diffeo_calib_"), places.name)
+    weakref.finalize(found, shutil.rmtree, os.path.dirname(found), ignore_errors=True)
+    with found.open("w", encoding="utf-8", newline="") as file:
+        _write(file, tables, pairs, sep)
+    found.words = f"{places}, joined with {joints}"
+    found.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
+    found.sentence += f"; lines without a partner: {' and '.join(without)}" * bool(without)
+    return found
+
+
+def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
+    """Times (N,) and (M,) that are the nearest to each other, within half a step; and in words."""
+    step = min(float(np.median(np.diff(np.sort(own)))) for own in (joints, places))
+    nearest = [(_nearest(joints, at), place) for place, at in enumerate(places)]
+    apart = {pair: float(abs(joints[pair[0]] - places[pair[1]])) for pair in nearest}
+    pairs = [one for one in nearest if apart[one] < 0.5 * step and _nearest(places, joints[one[0]]) == one[1]]
+    return pairs, f"by the nearest time, at most {max((apart[pair] for pair in pairs), default=0.0):.3g} apart"
+
+
+def _at_stops(tables: Sequence[_Table], times: Sequence[Array], decimal: str) -> tuple[Pairs, str]:
+    """The lines in the middle of every stop of two recordings, whose clocks may differ; and in words."""
+    joints, seen = (_motion(own, at, decimal) for own, at in zip(tables, times, strict=True))
+    found, offset = stops(joints, Recording(seen.times, seen.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
+    pairs = [(_nearest(times[0], stop.time), _nearest(times[1], stop.time - offset)) for stop in found]
+    return pairs, f"at the middle of every stop, {offset:+.2f} s added to the times of {tables[1].path.name}"
+
+
+def _nearest(times: Array, time: float) -> int:
+    return int(np.abs(times - time).argmin())
+
+
+def _motion(own: _Table, times: Array, decimal: str) -> Recording:
+    """The columns of numbers that do not always grow, in units of what is no motion; the clearest ones first."""
+    columns = [own.numbers(place, decimal) for place in range(len(own.header)) if place != own.by]
+    moving = [v for v in columns if np.isfinite(v).all() and np.ptp(v) > 0.0 and not (np.diff(v) > 0).all()]
+    if not moving:
+        fix = "join the files by names, or remove the lines with empty cells"
+        raise MeasurementError.of(f"file '{own.path}'", expected="columns of numbers that move and rest", fix=fix)
+    scaled = [v / max(MOVED * np.ptp(v), NOISE_FACTOR * Recording(times, v[:, None]).noise) for v in moving]
+    return Recording(times, np.stack(sorted(scaled, key=np.ptp, reverse=True), axis=1))
+
+
+def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) -> None:
+    """MeasurementError for a line that has several partners; ``several``: lines of joints may."""
+    for k in (1,) if several else (0, 1):
+        row, count = Counter(pair[k] for pair in pairs).most_common(1)[0]
+        if count > 1:
+            own, other, (line, cells) = tables[k], tables[1 - k], tables[k].lines[row]
+            got = f"lines {few([other.lines[pair[1 - k]][0] for pair in pairs if pair[k] == row])} of '{other.path}'"
+            fix = "remove the lines that do not belong there"
+            fix += "; if they are of several markers, name the column of these (--marker)" * (k == 0)
+            what = f"file '{own.path}', line {line}, {tables[k].header[own.by]} {shown(cells[own.by])}"
+            raise MeasurementError.of(what, expected="one partner", got=got, fix=fix)
+
+
+def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> None:
+    """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
+    table, measured = tables
+    kept = [place for place in range(len(measured.header)) if place != measured.by]
+    twice = {*table.header} & {measured.header[place] for place in kept}
+    names = [f"joints.{name}" if name in twice else name for name in table.header]
+    names += [f"places.{name}" if name in twice else name for name in (measured.header[place] for place in kept)]
+    writer, at = csv.writer(file, delimiter=sep, lineterminator="\n"), 2
+    writer.writerow(names)
+    for row, place in pairs:
+        line, cells = measured.lines[place]
+        file.write("\n" * (line - at))
+        writer.writerow([" ".join(cell.split()) for cell in (*table.lines[row][1], *(cells[k] for k in kept))])
+        at = line + 1

@@ -1,0 +1,159 @@
+"""Tables whose lines name their marker, and measured places in a file of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import torch
+from command_bank import Command
+from torch.testing import assert_close
+
+from diffeo_calib.cli.options import Places, Rows, StoredUnits, Units
+from diffeo_calib.cli.proposals import with_places
+from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+FIT = "diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --places p.csv --by name -o m"
+UNITS = Units(length="mm", angle="deg")
+ARM = SimulatedArm(seed=2, markers=3)
+ROWS = 30
+
+
+class Files(NamedTuple):
+    """A robot; its table with one marker in each line; the same in two files, the second one in another order."""
+
+    urdf: Path
+    whole: Path
+    joints: Path
+    places: Path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder = tmp_path_factory.mktemp("files")
+    found = Files(*(folder / name for name in ("arm.urdf", "whole.csv", "joints.csv", "places.csv")))
+    ARM.write_urdf(found.urdf)
+    q, points = ARM.measure(ROWS, seed=3)
+    joints = [list(ARM.nominal.joint_names), q.rad2deg().tolist()]
+    seen = [[*(1e3 * points[row, row % 3]).tolist(), ("front", "left", "top")[row % 3]] for row in range(ROWS)]
+    names, xyz, table = [f"P{row}" for row in range(ROWS)], ["x", "y", "z", "reflector"], TableFormat("mm", "deg")
+    write_rows(found.whole, [*joints[0], *xyz], [[[*a, *b] for a, b in zip(joints[1], seen, strict=True)]], table)
+    write_rows(found.joints, ["name", *joints[0]], [[[a, *b] for a, b in zip(names, joints[1], strict=True)]], table)
+    order = [*zip(seen, names, strict=True)][::-1]
+    write_rows(found.places, [*xyz, "name"], [[[*a, b] for a, b in order[1:]]], table)
+    return found
+
+
+def test_later_tables_have_the_markers_of_the_model() -> None:
+    """The order of the markers is kept with the model, also where the column is typed."""
+    command = f"{FIT} --marker smr --marker smr=b,a,c"
+    assert as_at_the_fit(command, Rows(), StoredUnits())[0].marker == "smr=b,a,c"
+    for typed, expected in (("ball", "ball=b,a,c"), ("ball=c,a", "ball=c,a")):
+        given = Rows(position=["x,y,z"], marker=typed)
+        assert as_at_the_fit(command, given, StoredUnits(length="m", angle="rad"))[0].marker == expected
+    assert as_at_the_fit(FIT, Rows(marker="ball"), StoredUnits())[0].marker == "ball"
+
+
+def test_the_file_of_places_is_that_of_its_table() -> None:
+    rows, _ = as_at_the_fit(FIT, Rows(), StoredUnits())
+    assert rows == Rows(position=["x,y,z"])
+    rows, _ = as_at_the_fit(FIT, Rows(places=Path("new.csv")), StoredUnits())
+    assert rows == Rows(position=["x,y,z"], places=Path("new.csv"), by="name")
+
+
+def test_two_files_are_read_as_one(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top")
+    whole = measured_table(files.whole, rows, UNITS).read(ARM.nominal)
+    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top", places=files.places, by="name")
+    assert rows_in_table(files.joints, rows, UNITS) == (rows, [])
+    both = measured_table(files.joints, rows, UNITS).read(ARM.nominal)
+    back = torch.arange(ROWS - 2, -1, -1)
+    assert_close(both.q, whole.q[back], rtol=0, atol=0)
+    assert_close(both.points, whole.points[back], rtol=0, atol=0, equal_nan=True)
+    assert both.line_numbers.tolist() == [*range(2, ROWS + 1)]
+    assert "1 of joints.csv (P29)" in capsys.readouterr().out
+
+
+def test_init_finds_the_column_of_the_markers(files: Files, tmp_path: Path, command: Command) -> None:
+    done = command("init", files.whole, files.urdf, "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in done.out
+    assert 'length = "mm"' in done.out
+
+
+def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command) -> None:
+    done = command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    assert (
+        'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in done.out
+    )
+    for words in (
+        'places.csv"  # the measured places',
+        'marker = "reflector"',
+        'length = "mm"',
+        "# all columns are used",
+    ):
+        assert words in done.out
+    assert command("fit", tmp_path / "c.toml", "--position", "x").err.endswith("expected three columns X,Y,Z, got x\n")
+
+
+def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> None:
+    (tmp_path / "j.csv").write_text("time,robot,pose,a\n0.5,R1,7,1\n1.5,R1,8,2\n")
+    (tmp_path / "p.csv").write_text("pose;time;robot;x\n8;0.4;R1;1\n7;1.6;R1;2\n")
+    path, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
+    assert [entry.value for entry in entries] == ["p.csv", "pose"]
+    assert read_cells(path, ",")[1] == [
+        (2, ["1.5", "R1", "8", "2", "0.4", "R1", "1"]),
+        (3, ["0.5", "R1", "7", "1", "1.6", "R1", "2"]),
+    ]
+
+
+def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
+    done = command("init", files.joints, files.urdf, "-o", tmp_path / "c.toml")
+    assert "if they are in another file: --places FILE --by name;" in done.error
+    done = command("init", files.joints, files.urdf, "--places", files.whole, "-o", tmp_path / "c.toml")
+    assert "--places without --by: expected a column that both files have" not in done.error
+    (tmp_path / "p.csv").write_text("x,y,z\n1,2,3\n")
+    done = command("init", files.joints, files.urdf, "--places", tmp_path / "p.csv", "-o", tmp_path / "c.toml")
+    assert "--places without --by: expected a column that both files have, got name, " in done.error
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fit", "JOINTS", "--places", "PLACES"], "--places and --by belong together"),
+        (["fit", "JOINTS", "--by", "name"], "--places and --by belong together"),
+        (["campaign", "JOINTS", "--places", "PLACES", "--by", "name"], "--places or --marker, of a table that grows"),
+        (["campaign", "WHOLE", "--marker", "reflector"], "--places or --marker, of a table that grows"),
+        (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "`marker` (reflector): expected one position"),
+    ],
+)
+def test_options_that_do_not_go_together(words: list[str], message: str, files: Files, command: Command) -> None:
+    named = {"JOINTS": files.joints, "WHOLE": files.whole, "PLACES": files.places}
+    given = ["--robot", files.urdf, "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "deg"]
+    output = ["-o", files.urdf.with_name("m.safetensors")] * (words[0] == "fit")
+    done = command(*(named.get(word, word) for word in words), *given, "--position", "x,y,z", *output)
+    assert message in done.error
+
+
+@pytest.mark.slow
+def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command) -> None:
+    """From two files to a model, and to the errors of a table of some markers in another order."""
+    assert command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml").code == 0
+    done = command("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
+    assert done.code == 0, done.err
+    header, *lines = files.whole.read_text().splitlines()
+    some = [line for line in lines if not line.endswith("left")]
+    (tmp_path / "some.csv").write_text("\n".join([header, *some]) + "\n")
+    done = command("evaluate", tmp_path / "m.safetensors", tmp_path / "some.csv")
+    assert done.code == 0, done.err
+    assert done.numbers("in all")[0] < 0.1
+    (tmp_path / "some.csv").write_text("\n".join([header, *some]).replace("front", "rear") + "\n")
+    done = command("evaluate", tmp_path / "m.safetensors", tmp_path / "some.csv")
+    assert "column 'reflector': expected markers of the model: " in done.error
+    assert "got rear" in done.error

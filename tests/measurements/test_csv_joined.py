@@ -1,0 +1,117 @@
+"""Joint values in one file and measured places in another."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+
+JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
+PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")
+
+
+def joined(
+    folder: Path, joints: tuple[str, ...] = JOINTS, places: tuple[str, ...] = PLACES, by: str = "pose", **how: bool
+) -> JoinedFile:
+    for name, lines in (("joints", joints), ("places", places)):
+        (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    return joined_file(folder / "joints.csv", folder / "places.csv", by, **how)
+
+
+def test_lines_have_the_numbers_of_the_places(tmp_path: Path) -> None:
+    found = joined(tmp_path)
+    header, lines = read_cells(found, ",")
+    assert header == ["pose", "a", "b", "x", "y", "z"]
+    assert lines == [(2, ["p3", "5", "6", "9", "9", "9"]), (4, ["p1", "1", "2", "8", "8", "8"])]
+    assert found.sentence == (
+        "2 lines of places.csv are joined with lines of joints.csv by pose; lines without a partner: "
+        "1 of joints.csv (p2) and 1 of places.csv (p4)"
+    )
+
+
+def test_messages_name_both_files(tmp_path: Path) -> None:
+    found = joined(tmp_path, places=(*PLACES[:3], "?,8,8,p1"))
+    with pytest.raises(
+        MeasurementError, match=r"places\.csv, joined with .*joints\.csv', line 4, column 'x'.*got '\?'"
+    ):
+        dc.read_measurements(found, ["a", "b"], ["x", "y", "z"], length="m", angle="rad")
+
+
+def test_the_file_goes_with_its_path(tmp_path: Path) -> None:
+    found = joined(tmp_path)
+    folder = Path(found.__fspath__()).parent
+    assert folder.is_dir()
+    del found
+    assert not folder.exists()
+
+
+def test_files_may_have_separators_of_their_own(tmp_path: Path) -> None:
+    found = joined(tmp_path, places=tuple(line.replace(",", ";") for line in PLACES))
+    assert read_cells(found, ",")[1][0] == (2, ["p3", "5", "6", "9", "9", "9"])
+
+
+def test_a_name_in_both_files_says_of_which_it_is(tmp_path: Path) -> None:
+    header, _ = read_cells(joined(tmp_path, joints=("pose,x,b", *JOINTS[1:])), ",")
+    assert header == ["pose", "joints.x", "b", "places.x", "y", "z"]
+
+
+def test_several_partners_are_one_error(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=r"places\.csv', line 2, pose p3: expected one partner, got lines 4, 5"):
+        joined(tmp_path, joints=(*JOINTS, "p3,7,8"))
+    twice = (*PLACES, "6,6,6,p1")
+    with pytest.raises(MeasurementError, match=r"joints\.csv', line 2, pose p1: .* got lines 4, 6 .*--marker"):
+        joined(tmp_path, places=twice)
+    assert len(read_cells(joined(tmp_path, places=twice, several=True), ",")[1]) == 3
+
+
+def test_files_without_common_values_are_one_error(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=r"--by pose: expected values that both files have, got 3 of joints.csv"):
+        joined(tmp_path, places=("x,y,z,pose", "1,2,3,q1"))
+    with pytest.raises(MeasurementError, match=r"places\.csv', header: no column \['name'\]"):
+        joined(tmp_path, joints=("name,a,b", *JOINTS[1:]), by="name")
+
+
+def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
+    """Each line of the shorter file has a partner, unless the other one has a gap there."""
+    times = [0.0, 1.0, 2.0, 5.0, 6.0, 7.0]
+    joints = ("t,a", *(f"{t},{k}" for k, t in enumerate(times)))
+    places = ("t,x", "0.8,10", "3.4,11", "6.3,12")
+    found = joined(tmp_path, joints, places, "t")
+    assert [(line, cells[1:]) for line, cells in read_cells(found, ",")[1]] == [(2, ["1", "10"]), (4, ["4", "12"])]
+    assert "by the nearest time, at most 0.3 apart" in found.sentence
+    assert "1 of places.csv (3.4)" in found.sentence
+    other = joined(tmp_path, ("t,a", "0.8,10", "3.4,11", "6.3,12"), ("t,x", *joints[1:]), "t")
+    assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.37])
+def test_recordings_with_clocks_of_their_own(offset: float, tmp_path: Path) -> None:
+    """One line for every stop, from its middle; columns that only count or that do not move do not matter."""
+    rng = np.random.default_rng(0)
+    ends = np.cumsum(rng.uniform(1.0, 2.0, 12))
+    goals = rng.uniform(-90.0, 90.0, 13)
+
+    def at(times: np.ndarray) -> np.ndarray:
+        """Moves of half a second between stops."""
+        return goals[0] + sum(
+            (goals[k + 1] - goals[k]) * np.clip((times - end) / 0.5, 0.0, 1.0) for k, end in enumerate(ends)
+        )
+
+    one, two = np.arange(0.0, 20.0, 0.01), np.arange(0.4, 19.0, 0.037)
+    joints = ("t,n,a,c", *(f"{t:.3f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
+    seen = at(two)[:, None] * [1.0, 2.0, -3.0] + rng.normal(0.0, 0.01, (len(two), 3))
+    places = ("t,x,y,z", *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)))
+    found = joined(tmp_path, joints, places, "t")
+    rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
+    assert 8 <= len(rows) <= 13
+    assert np.abs(rows[:, 4] - rows[:, 2]).max() < 0.1
+    words = re.search(r"middle of every stop, (\S*) s added to the times of places.csv", found.sentence)
+    assert words is not None
+    assert abs(float(words[1]) - offset) < 0.03
