@@ -201,11 +201,12 @@ class ImagesOptions(Command):
 
     folders: list[Path] = argument("FOLDER", "Folder of the images, or one of each camera.")
     joints: Path = argument(
-        "JOINTS", "Table of joint values, with a column of file names unless rows are in their order."
+        "JOINTS",
+        "Table of joint values, with a column of file names unless rows are in the order of the numbers in these.",
     )
     board: str = option(
         "Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner "
-        "corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
+        "corners), aruco:4x5:SIDE:GAP:DICT (with :right-up if its numbers run upwards) or tag:SIDE:DICT:NUMBER.",
         "BOARD",
         default=...,
     )
