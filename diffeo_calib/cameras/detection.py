@@ -81,7 +81,7 @@ class Board:
             raise InputError.of("the board", expected=expected + "tag:0.1:DICT_APRILTAG_36h11:3", got=text)
         try:
             made = {"charuco": _charuco, "chessboard": _chessboard, "aruco": _grid, "tag": _tag}[kind](cv2, words)
-        except (ValueError, AttributeError, cv2.error) as error:
+        except (ValueError, AttributeError, SystemError, cv2.error) as error:
             fix = "lengths in m, numbers of squares as 5x7, a dictionary of OpenCV such as DICT_5X5_100"
             what, expected = f"the board {text}", "numbers and a dictionary"
             raise InputError.of(what, expected=expected, got=str(error), fix=fix) from None

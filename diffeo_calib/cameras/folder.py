@@ -125,16 +125,16 @@ def read_folders(
         fix = "leave it out: the folders name the cameras"
         raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
     place = _column_of_images(header, rows)
-    files = (
-        _ordered(folders, joints, len(rows)) if place is None else _named(folders, [row[place].strip() for row in rows])
-    )
+    if place is None:
+        files = _ordered(folders, joints, len(rows))
+    else:
+        files = _named(folders, [row[place].strip() for row in rows])
     kept = [k for k in range(len(header)) if k != place]
     header, rows = [header[k] for k in kept], [[row[k] for k in kept] for row in rows]
     found = []
     for folder, name, own in zip(folders, names, files, strict=True):
         whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
-        first, *_, last = [file for file, _ in whole]
-        paired = f"row 1 is {first}, row {len(whole)} is {last}: by the numbers in the names" * (place is None)
+        paired = f"row 1 is {own[0]}, row {len(own)} is {own[-1]}: by the numbers in the names" * (place is None)
         found.append(_folder(folder, Folder(name, board, header, [], (0, 0), paired), whole, progress))
     return found
 
@@ -154,17 +154,15 @@ def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]],
         images.append(_seen(*own, image, board, usual))
     found = replace(empty, images=images, size=(usual[1], usual[0]))
     if len(found.used) <= sum(one.refused.startswith(BENT) for one in images):
-        reasons, some = (
-            few([f"{one.name}: {one.refused}" for one in images]),
-            [own for own in read if own is not None][:3],
-        )
+        some = [own for own in read if own is not None][:3]
         layout = other_layout(some, board)
         likely = layout or next(filter(None, map(other_dictionary, some)), None)
         fix = "check the board and the images" if likely is None else f"most markers are of {likely}: check --board"
         if layout:
             fix = f"give the board as {layout}, which explains the corners{KALIBR * layout.endswith(FLIPPED)}"
         what = f"images of '{folder}' that show {board.text}"
-        raise MeasurementError.of(what, expected="some", got=reasons, fix=fix)
+        got = few([f"{one.name}: {one.refused}" for one in images])
+        raise MeasurementError.of(what, expected="some", got=got, fix=fix)
     return found
 
 
@@ -205,8 +203,9 @@ def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str
 
 
 def _by_numbers(name: str) -> list[tuple[str, int]]:
-    """Texts of a name, each with the number behind it."""
-    return [(text, int(number or -1)) for text, number in re.findall(r"(\D*)(\d*)", name.lower())]
+    """Texts of a name, each with the number behind it, and the name."""
+    parts = re.findall(r"(\D*)(\d*)", name.lower())
+    return [*((text, int(number or -1)) for text, number in parts), (name, 0)]
 
 
 def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:

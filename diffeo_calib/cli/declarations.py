@@ -133,12 +133,7 @@ class RecordOptions(Command):
     """
 
     bag: Path = argument("BAG", "Folder of a ROS 2 bag, or file of a ROS 1 bag.")
-    seen: str = option(
-        "Stamped points, poses or transforms that a device measured, with frames for /tf:CHILD or '/tf:PARENT>CHILD'; "
-        "or images.",
-        "TOPIC",
-        default=...,
-    )
+    seen: str = option("Stamped points or poses, /tf:CHILD or '/tf:PARENT>CHILD'; or images.", "TOPIC", default=...)
     output: Path = output("Table to write.", "CSV")
     joints: str = option("Joint states; TOPIC:NAME,NAME takes some joints.", "TOPIC", default="/joint_states")
     still: float = option("Largest motion of a joint at a stop.", min=1e-9, default=1e-3)

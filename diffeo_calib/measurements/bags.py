@@ -115,9 +115,7 @@ def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str,
     moved = [edge for edge, _ in paths[0] if edge not in fixed] if len(paths) == 1 else []
     if not moved:
         expected = f"one moving frame, as --seen '{topic}:CHILD' or '{topic}:PARENT>CHILD'"
-        got = (
-            f"{frames or 'none'} of {few([f'{one}>{other}' for one, other in edges if (one, other) not in fixed], 20)}"
-        )
+        got = f"{frames or 'none'} of {few(['>'.join(edge) for edge in edges if edge not in fixed], 20)}"
         raise MeasurementError.of(f"the frame in {topic}", expected=expected, got=got)
     tables = {edge: _recording(edges[edge], f"{'>'.join(edge)} in {topic}") for edge in moved}
     first, last = max(one.times[0] for one in tables.values()), min(one.times[-1] for one in tables.values())
@@ -232,7 +230,8 @@ def _part(message: Any, path: str) -> Any:
 
 
 def _recording(rows: list[list[float]], topic: str) -> Recording:
-    """Rows (time, values) in the order of time; quaternions with one sign."""
+    """Rows (time, values) of numbers in the order of time; quaternions with one sign."""
+    rows = [row for row in rows if np.isfinite(row).all()]
     if len(rows) < 3:
         raise MeasurementError.of(f"messages of {topic}", expected="at least 3", got=str(len(rows)))
     table: Array = np.array(sorted(rows))
