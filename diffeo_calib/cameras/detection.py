@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -152,14 +153,13 @@ def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
     kind, size, *words = board.text.split(":")
     if not seen or kind not in ("charuco", "aruco"):
         return None
-    own, every = _size(size), np.concatenate([numbers for _, numbers, _ in seen])
-    others = [(across, max(2, -(-own[0] * own[1] // across))) for across in range(2, WIDEST)]
-    sizes = dict.fromkeys([own, own[::-1], *others])
-    starts = dict.fromkeys([min(board.layout), 0, int(every.min())]) if kind == "aruco" else {}
-    best, found = PLANE_SHARE / 2, None
-    for end in [f":{first}:{order}" for first in starts for order in ORDERS] or [""]:
-        for across, down in sizes:
-            text = ":".join([kind, f"{across}x{down}", *words[:3]]) + end
+    grid, own, every = kind == "aruco", _size(size), np.concatenate([numbers for _, numbers, _ in seen])
+    best, likely = PLANE_SHARE / 2, None
+    starts = dict.fromkeys([min(board.layout), int(every.min()), 0]) if grid else [0]
+    for across, given in [own, own[::-1], *((width, 0) for width in range(2, WIDEST))]:
+        for first, order in product(starts, ORDERS if grid else [""]):
+            down = given or max(2, -(-(int(every.max()) + 1 - first) * (1 if grid else 2) // across))
+            text = ":".join([kind, f"{across}x{down}", *words[:3], *[str(first), order] * grid])
             try:
                 layout = Board.of(text).layout
             except InputError:  # more markers than the dictionary has
@@ -167,8 +167,8 @@ def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
             if set(layout).issuperset(every.tolist()):
                 each = (([layout[n] for n in numbers.tolist()], corners, grey) for grey, numbers, corners in seen)
                 share = max(misfit(np.concatenate(p), at.reshape(-1, 2), grey)[1] for p, at, grey in each)
-                best, found = (share, text) if share < 0.8 * best else (best, found)
-    return found
+                best, likely = (share, text) if share < 0.8 * best else (best, likely)
+    return likely
 
 
 def other_dictionary(grey: np.ndarray) -> str | None:
@@ -271,7 +271,7 @@ def _grid(cv2: Any, words: list[str]) -> Made:
     markers, (across, down) = _dictionary(cv2, words[3]), _size(words[0])
     order = next((word for word in words[4:] if not word.isdecimal()), ORDERS[0])
     if order not in ORDERS:
-        raise InputError.of("the order of the numbers of a grid", expected=f"one of {few(ORDERS, 8)}", got=order)
+        raise ValueError(f"the order {order}, none of {few(ORDERS, 8)}")
     numbers = np.arange(across * down) + int(next(filter(str.isdecimal, words[4:]), 0))
     grid = numbers.reshape(down, across) if order.startswith(ACROSS) else numbers.reshape(across, down).T
     grid = grid[:: -1 if "up" in order else 1, :: -1 if "left" in order else 1]

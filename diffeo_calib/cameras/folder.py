@@ -156,12 +156,14 @@ def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]],
     if len(found.used) <= sum(one.refused.startswith(BENT) for one in images):
         some = [own for own in read if own is not None][:3]
         layout = other_layout(some, board)
-        likely = layout or next(filter(None, map(other_dictionary, some)), None)
-        fix = "check the board and the images" if likely is None else f"most markers are of {likely}: check --board"
+        likely = None if layout else next(filter(None, map(other_dictionary, some)), None)
+        fix = "check the lengths and numbers of the board, and the images"
         if layout:
             fix = f"give the board as {layout}, which explains the corners{KALIBR * layout.endswith(FLIPPED)}"
+        elif likely and likely.rpartition("_")[0] not in board.text.upper():
+            fix = f"most markers are of {likely}: check --board"
         what = f"images of '{folder}' that show {board.text}"
-        got = few([f"{one.name}: {one.refused}" for one in images])
+        got = few([f"{one.name}: {one.refused}" for one in images if one.refused])
         raise MeasurementError.of(what, expected="some", got=got, fix=fix)
     return found
 
