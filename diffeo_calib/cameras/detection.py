@@ -2,22 +2,24 @@
 
 A board is written as one text, lengths in m: `charuco:ACROSSxDOWN:SQUARE:MARKER:DICT` (squares, their sides and those
 of the markers), `chessboard:ACROSSxDOWN:SQUARE` (inner corners), `aruco:ACROSSxDOWN:SIDE:GAP:DICT` (a grid of markers,
-AprilTags by their dictionaries) or `tag:SIDE:DICT:NUMBER`. The board's frame is in its middle.
+AprilTags by their dictionaries) or `tag:SIDE:DICT:NUMBER`. Behind a grid may stand its first number, `:0` by default,
+and where numbers run where markers stand upright, `:right-down` by default. The board's frame is in its middle.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from diffeo_calib.common.errors import InputError, few
 
-FORMS = {"charuco": 5, "chessboard": 3, "aruco": 5, "tag": 4}
+FORMS = {"charuco": (5,), "chessboard": (3,), "aruco": (5, 6, 7), "tag": (4,)}
 """Kinds of boards, and words of their texts."""
 FEWEST_CORNERS = 8
 BLURRED_PX, MOVED_RATIO = 5.0, 1.6
@@ -25,12 +27,27 @@ BLURRED_PX, MOVED_RATIO = 5.0, 1.6
 direction, from which something moved. A lens that blurs by a standard deviation of 0.7 px makes widths of 2."""
 HALF_PATCH_PX = 8
 """Half of the side of the patch around a corner in which edges are measured, pixels."""
-
+ACROSS, DOWN = ("right", "left"), ("down", "up")
+ORDERS = [f"{one}-{other}" for first, then in ((ACROSS, DOWN), (DOWN, ACROSS)) for one in first for other in then]
+"""Where the numbers of a grid of markers run, first within a line."""
+PLANE_SHARE, PLANE_PX = 0.12, 2.0
+"""Median distance of corners from those of a plane, as a share of their spread and in pixels, from which it is none."""
+BENDS = (0.0, 0.1, 0.2, -0.1, -0.2, -0.3, -0.4, -0.5, -0.6)
+"""Distortions b with which a plane is tried: r / (1 + b r^2), with r = 1 from the image's middle to its corners."""
+SNAPPED_PX, SNAPPED_SHARE = 0.5, 0.13
+"""Median distance from a plane from which corners of markers are sought again, within this share of a marker's side:
+those that touch squares, as in grids of Kalibr, are found too far inside."""
+WIDEST = 16
+"""Squares or markers across other boards that are tried."""
 REFINED_PX = 5
 """Half of the side of the window in which corners of a ChArUco board are refined: detectors leave twice the error."""
 Found = tuple[np.ndarray, np.ndarray]
 """Numbers (K,) of corners, and their pixels (K, 2)."""
 NONE: Found = np.zeros(0, int), np.zeros((0, 2))
+Made = tuple[np.ndarray, Callable[[np.ndarray], Found], Callable[[np.ndarray], Found], dict[int, np.ndarray]]
+"""Points, find, markers and layout of a board."""
+BENT = "corners that no plane explains"
+"""The reason of an image whose corners contradict the board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +56,16 @@ class Board:
 
     Args:
         text: as it was written. points: (K, 3) its corners, m, from its middle.
-        find: grey image -> corners, which may be none. markers: grey image -> numbers of all markers; none of a
-            chessboard. fewest: corners that an image must show.
+        find: grey image -> corners, which may be none. markers: grey image -> numbers of all markers and their corners
+            (M, 4, 2), pixels; none of a chessboard. layout: number of each marker of the board -> its corners (4, 3),
+            m. fewest: corners that an image must show.
     """
 
     text: str
     points: np.ndarray
     find: Callable[[np.ndarray], Found]
-    markers: Callable[[np.ndarray], list[int]]
+    markers: Callable[[np.ndarray], Found]
+    layout: dict[int, np.ndarray]
     fewest: int
 
     @classmethod
@@ -58,34 +77,38 @@ class Board:
         """
         cv2 = opencv()
         kind, *words = text.split(":")
-        if kind not in FORMS or len(words) + 1 != FORMS[kind]:
+        if kind not in FORMS or len(words) + 1 not in FORMS[kind]:
             expected = "charuco:5x7:0.04:0.03:DICT_5X5_100, chessboard:7x5:0.03, aruco:4x5:0.04:0.01:DICT or "
             raise InputError.of("the board", expected=expected + "tag:0.1:DICT_APRILTAG_36h11:3", got=text)
         try:
             made = {"charuco": _charuco, "chessboard": _chessboard, "aruco": _grid, "tag": _tag}[kind](cv2, words)
-        except (ValueError, AttributeError, cv2.error) as error:
+        except (ValueError, AttributeError, SystemError, cv2.error) as error:
             fix = "lengths in m, numbers of squares as 5x7, a dictionary of OpenCV such as DICT_5X5_100"
             what, expected = f"the board {text}", "numbers and a dictionary"
             raise InputError.of(what, expected=expected, got=str(error), fix=fix) from None
-        points, find, markers = made
+        points, find, markers, layout = made
         middle = (points.min(0) + points.max(0)) / 2
-        return cls(text, points - middle, find, markers, min(FEWEST_CORNERS, len(points)))
+        return cls(text, points - middle, find, markers, layout, min(FEWEST_CORNERS, len(points)))
 
     def corners(self, grey: np.ndarray) -> Found:
         """Numbers and pixels of the corners in an image.
 
         Raises:
-            InputError: none or too few, two boards, a blurred image; the reason is the message.
+            InputError: none or too few, two boards, a blurred image, another layout; the reason is the message.
         """
-        repeated = [number for number, count in Counter(self.markers(grey)).items() if count > 1]
+        counts = Counter(number for number in self.markers(grey)[0].tolist() if number in self.layout)
+        repeated = [number for number, count in counts.items() if count > 1]
         if repeated:
             raise InputError.of("two boards", got=f"marker {few(sorted(repeated))} twice", fix="cover one of them")
         numbers, pixels = self.find(grey)
         if len(numbers) < self.fewest:
             if len(self.find(np.ascontiguousarray(grey[:, ::-1]))[0]) >= self.fewest:
                 raise InputError.of("a mirrored board", fix="print it anew, or mirror the images back")
-            got = "none" if not len(numbers) else len(numbers)
+            got = len(numbers) or "none"
             raise InputError.of("corners of the board", expected=f"{self.fewest} or more", got=got)
+        away, share = misfit(self.points[numbers], pixels, grey)
+        if share > PLANE_SHARE and away > PLANE_PX:
+            raise InputError.of(f"{BENT}, by {away:.1f} px")
         widths = edge_widths(grey, pixels)
         if widths.max() > BLURRED_PX:
             moved = widths.max() > MOVED_RATIO * widths.min()
@@ -105,13 +128,56 @@ def opencv() -> Any:
     return cv2
 
 
+def misfit(points: np.ndarray, pixels: np.ndarray, grey: np.ndarray) -> tuple[float, float]:
+    """Median distance, pixels, of corners (K, 2) from the best image of a plane with corners (K, 3), m; and its share.
+
+    The share is that of the corners' spread in the grey image. Four corners are an image of any plane.
+    """
+    cv2, best = opencv(), (0.0, 0.0) if len(points) <= 4 else (np.inf, np.inf)
+    middle, flat = np.array(grey.shape[::-1]) / 2, np.column_stack([points[:, :2], np.ones(len(points))])
+    for bend in BENDS if len(points) > 4 else ():
+        seen = (pixels - middle) / (1 + bend * ((pixels - middle) ** 2).sum(1) / (middle**2).sum())[:, None]
+        H = cv2.findHomography(points[:, :2], seen)[0]
+        if H is not None:
+            ideal = flat @ H.T
+            away = float(np.median(np.linalg.norm(ideal[:, :2] / ideal[:, 2:] - seen, axis=1)))
+            best = min(best, (away / float(seen.std(0).max()), away))
+        if best[0] > 4 * PLANE_SHARE:  # more than any lens bends
+            break
+    return best[1], best[0]
+
+
+def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
+    """The text of another board with the same markers that a plane explains in grey images; None if there is none."""
+    seen = [(grey, found[0], _snapped(grey, found[1])) for grey in images if len((found := board.markers(grey))[0]) > 1]
+    kind, size, *words = board.text.split(":")
+    if not seen or kind not in ("charuco", "aruco"):
+        return None
+    grid, own, every = kind == "aruco", _size(size), np.concatenate([numbers for _, numbers, _ in seen])
+    best, likely = PLANE_SHARE / 2, None
+    starts = dict.fromkeys([min(board.layout), int(every.min()), 0]) if grid else [0]
+    for across, given in [own, own[::-1], *((width, 0) for width in range(2, WIDEST))]:
+        for first, order in product(starts, ORDERS if grid else [""]):
+            down = given or max(2, -(-(int(every.max()) + 1 - first) * (1 if grid else 2) // across))
+            text = ":".join([kind, f"{across}x{down}", *words[:3], *[str(first), order] * grid])
+            try:
+                layout = Board.of(text).layout
+            except InputError:  # more markers than the dictionary has
+                continue
+            if set(layout).issuperset(every.tolist()):
+                each = (([layout[n] for n in numbers.tolist()], corners, grey) for grey, numbers, corners in seen)
+                share = max(misfit(np.concatenate(p), at.reshape(-1, 2), grey)[1] for p, at, grey in each)
+                best, likely = (share, text) if share < 0.8 * best else (best, likely)
+    return likely
+
+
 def other_dictionary(grey: np.ndarray) -> str | None:
     """Name of the dictionary of most markers in an image; None if there are few of any."""
     cv2 = opencv()
     counts = {}
     for name in (name for name in dir(cv2.aruco) if name.startswith("DICT_")):
         detector = cv2.aruco.ArucoDetector(_dictionary(cv2, name))
-        counts[name] = len(_all_markers(detector, grey))
+        counts[name] = len(_all_markers(detector, grey)[0])
     best = max(counts, key=lambda name: counts[name])
     return best if counts[best] >= 3 else None
 
@@ -147,12 +213,27 @@ def _dictionary(cv2: Any, name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, whole))
 
 
-def _all_markers(detector: Any, grey: np.ndarray) -> list[int]:
-    numbers = detector.detectMarkers(grey)[1]
-    return [] if numbers is None else numbers.ravel().tolist()
+def _all_markers(detector: Any, grey: np.ndarray) -> Found:
+    corners, numbers, _ = detector.detectMarkers(grey)
+    if numbers is None:
+        return NONE
+    return np.ravel(numbers), np.concatenate(corners).astype(float)
 
 
-def _charuco(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
+def _snapped(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Corners (M, 4, 2) of markers, moved to the nearest corners of the image, pixels."""
+    half = max(3, round(SNAPPED_SHARE * float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))))
+    start = corners.reshape(-1, 1, 2).astype(np.float32)
+    return opencv().cornerSubPix(grey, start, (half, half), (-1, -1), (3, 50, 1e-4)).reshape(-1, 4, 2).astype(float)
+
+
+def _layout(board: Any) -> dict[int, np.ndarray]:
+    """Number of each marker -> its corners (4, 3), m."""
+    each = zip(np.ravel(board.getIds()).tolist(), board.getObjPoints(), strict=True)
+    return {number: np.array(corners, float).reshape(4, 3) for number, corners in each}
+
+
+def _charuco(cv2: Any, words: list[str]) -> Made:
     markers = _dictionary(cv2, words[3])
     board = cv2.aruco.CharucoBoard(_size(words[0]), float(words[1]), float(words[2]), markers)
     detectors = [cv2.aruco.CharucoDetector(board)]
@@ -170,10 +251,11 @@ def _charuco(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
         return NONE
 
     plain = cv2.aruco.ArucoDetector(markers)
-    return np.array(board.getChessboardCorners(), float), find, lambda grey: _all_markers(plain, grey)
+    points = np.array(board.getChessboardCorners(), float)
+    return points, find, lambda grey: _all_markers(plain, grey), _layout(board)
 
 
-def _chessboard(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
+def _chessboard(cv2: Any, words: list[str]) -> Made:
     across, down = _size(words[0])
     columns, rows = np.meshgrid(np.arange(across), np.arange(down))
     points = float(words[1]) * np.stack([columns.ravel(), rows.ravel(), 0 * rows.ravel()], 1)
@@ -182,36 +264,45 @@ def _chessboard(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
         found, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=cv2.CALIB_CB_ACCURACY)
         return (np.arange(len(points)), corners.reshape(-1, 2).astype(float)) if found else NONE
 
-    return points, find, lambda _: []
+    return points, find, lambda _: NONE, {}
 
 
-def _grid(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
-    markers = _dictionary(cv2, words[3])
-    board = cv2.aruco.GridBoard(_size(words[0]), float(words[1]), float(words[2]), markers)
-    own = {number: k for k, number in enumerate(np.ravel(board.getIds()).tolist())}
-    points = np.array(board.getObjPoints(), float).reshape(-1, 3)
-    return points, *_of_markers(cv2, markers, own)
+def _grid(cv2: Any, words: list[str]) -> Made:
+    markers, (across, down) = _dictionary(cv2, words[3]), _size(words[0])
+    order = next((word for word in words[4:] if not word.isdecimal()), ORDERS[0])
+    if order not in ORDERS:
+        raise ValueError(f"the order {order}, none of {few(ORDERS, 8)}")
+    numbers = np.arange(across * down) + int(next(filter(str.isdecimal, words[4:]), 0))
+    grid = numbers.reshape(down, across) if order.startswith(ACROSS) else numbers.reshape(across, down).T
+    grid = grid[:: -1 if "up" in order else 1, :: -1 if "left" in order else 1]
+    board = cv2.aruco.GridBoard((across, down), float(words[1]), float(words[2]), markers, grid.flatten())
+    return _of_markers(cv2, markers, _layout(board))
 
 
-def _tag(cv2: Any, words: list[str]) -> tuple[np.ndarray, Any, Any]:
+def _tag(cv2: Any, words: list[str]) -> Made:
     half = float(words[0]) / 2
     points = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    return points, *_of_markers(cv2, _dictionary(cv2, words[1]), {int(words[2]): 0})
+    return _of_markers(cv2, _dictionary(cv2, words[1]), {int(words[2]): points})
 
 
-def _of_markers(cv2: Any, markers: Any, own: dict[int, int]) -> tuple[Any, Any]:
+def _of_markers(cv2: Any, markers: Any, layout: dict[int, np.ndarray]) -> Made:
     """Corners of the markers with these numbers, four each."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(markers, parameters)
+    detector, points = cv2.aruco.ArucoDetector(markers, parameters), np.concatenate([*layout.values()])
+    first = {number: 4 * k for k, number in enumerate(layout)}
 
     def find(grey: np.ndarray) -> Found:
-        corners, seen, _ = detector.detectMarkers(grey)
-        numbers = np.zeros(0, int) if seen is None else np.ravel(seen)
-        known = [k for k, number in enumerate(numbers.tolist()) if number in own]
+        numbers, corners = _all_markers(detector, grey)
+        known = [k for k, number in enumerate(numbers.tolist()) if number in layout]
         if not known:
             return NONE
-        places = [4 * own[int(numbers[k])] + np.arange(4) for k in known]
-        return np.concatenate(places), np.concatenate([corners[k].reshape(4, 2) for k in known]).astype(float)
+        places = np.concatenate([first[int(numbers[k])] + np.arange(4) for k in known])
+        found = corners[known].reshape(-1, 2)
+        away = misfit(points[places], found, grey)[0]
+        if away > SNAPPED_PX:
+            snapped = _snapped(grey, corners[known]).reshape(-1, 2)
+            found = snapped if misfit(points[places], snapped, grey)[0] < away / 2 else found
+        return places, found
 
-    return find, lambda grey: [number for number in _all_markers(detector, grey) if number in own]
+    return points, find, lambda grey: _all_markers(detector, grey), layout

@@ -1,8 +1,9 @@
-"""Files of cameras: YAML of OpenCV and of ROS (camera_info), and what is known of lens and board beside them."""
+"""Files of cameras: lenses as OpenCV, ROS and Kalibr write them, and what is known of lens and board beside them."""
 
 from __future__ import annotations
 
-from math import inf
+import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -11,10 +12,37 @@ from torch import Tensor
 
 from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, few, warn_user
 from diffeo_calib.common.files import read_regular
 
-MATRICES = {"camera_matrix": 9, "distortion_coefficients": 5}
+MATRIX = ("camera_matrix", "k", "intrinsics", "intrinsic_matrix", "mtx")
+COEFFS = ("coeffs", "coefs", "coeff", "coef", "coefficients", "parameters")
+DISTORTION = (
+    "distortion_coefficients",
+    *("distortion", "dist", "d"),
+    *(f"{first}{last}" for first in ("", "d", "dist", "distortion") for last in COEFFS),
+)
+CENTRE = {"cx": ("cx", "ppx", "u0"), "cy": ("cy", "ppy", "v0")}
+SIZE = ("resolution", "image_size")
+"""Names of a matrix of 9 numbers or fx, fy, cx, cy, of the distortion, the principal point, and width and height."""
+FORMS = (
+    "`camera_matrix` with `distortion_coefficients` (OpenCV, ROS), `k` with `d` (topic echo of camera_info), "
+    "`intrinsics` with `distortion_coeffs` (Kalibr), or fx, fy, cx and cy"
+)
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Of lenses as files hold them; those after k3 must be zero."""
+MODELS = {"plumb_bob", "radtan", "radial-tangential", "brown_conrady", "rational_polynomial", "none"}
+"""Names of the distortion that is read."""
+READ = "a pinhole with plumb_bob or radtan, 0 after k1, k2, p1, p2, k3"
+MODEL_NAMES = re.compile("model|type|lens|distortion|projection|fisheye|^xi$")
+BENT = re.compile(
+    r"fisheye|equidist|equisolid|stereographic|kannala|omni|unified|\b(mei|ds|eucm|fov|xi)\b|double.?sphere|theta"
+)
+"""Words of lenses that are not read even without distortion; and names of lines with such words."""
+OTHER = re.compile("inverse|modified|division|prism")
+"""Words of another distortion."""
+WORD = re.compile(r"""(?<![\w.])["']?([A-Za-z_][\w.]*)(?:["'][ \t]*:|[ \t]*:(?=[\s\[{"']|$))""")
+"""A name before its value."""
 LARGEST_FILE = 1_000_000
 """Bytes of a file that no camera has."""
 LARGEST = 1e6
@@ -44,31 +72,124 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
 
 
 def read_camera(path: str | PathLike[str]) -> Camera:
-    """The camera of a file of this package, of OpenCV or of ROS.
+    """The camera of a file of this package, or of one in any of FORMS as YAML, JSON or XML.
 
     The lens of foreign files is taken as exact, and their board, of which they know nothing, has the size 0.
 
     Raises:
-        InputError: no such file, one that is no camera, or another distortion model than five coefficients.
+        InputError: no such file, one that is no camera or several, or another lens than a pinhole with k1, k2, p1, p2
+            and k3.
     """
     file = Path(path)
     try:
         text = read_regular(file, "camera file", LARGEST_FILE).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError.of(f"file '{file}'", expected="a camera's YAML file", got=str(error)) from None
-    values = {name: _numbers(file, text, name, count) for name, count in MATRICES.items()}
-    fx, _, cx, _, fy, cy = values["camera_matrix"][:6].tolist()
-    width, height = (int(_number(file, text, f"image_{name}")) for name in ("width", "height"))
-    lens = torch.cat([values["camera_matrix"].new_tensor([fx, fy, cx, cy]), values["distortion_coefficients"]])
-    if not (fx > 0 and fy > 0 and min(width, height) > 0):
-        raise InputError.of(
-            f"file '{file}'", expected="positive focal lengths and image size", got=f"{fx}, {fy}, {width}, {height}"
-        )
-    if f"\n{ROOT}:" not in text:
-        return Camera(width, height, 0.0, torch.cat([lens, lens.new_zeros(5)]), lens.new_zeros(len(UNKNOWNS), 0))
-    root = _numbers(file, text, ROOT, None).view(len(UNKNOWNS), -1)
-    half, noise = (_number(file, text, name) for name in ("board_half_size", "avg_reprojection_error"))
-    return Camera(width, height, half, torch.cat([lens, _numbers(file, text, BOARD, 5)]), root, noise)
+    lines = _Lines(file, text)
+    distortion = lines.distortion()
+    lens = lines.pinhole() + distortion
+    width, height = lines.size()
+    if not (min(lens[:2]) > 0 and min(width, height) > 0):
+        expected = "positive fx, fy, image_width and image_height"
+        raise InputError.of(f"file '{file}'", expected=expected, got=f"{lens[0]}, {lens[1]}, {width}, {height}")
+    known: Tensor = torch.tensor(lens, dtype=torch.float64, device=HOST)
+    if not lines.has(ROOT):
+        return Camera(width, height, 0.0, torch.cat([known, known.new_zeros(5)]), known.new_zeros(len(UNKNOWNS), 0))
+    root = lines.numbers((ROOT,), range(len(UNKNOWNS), len(UNKNOWNS) * LARGEST_FILE, len(UNKNOWNS)))
+    half, noise = (lines.numbers((name,), (1,))[0] for name in ("board_half_size", "avg_reprojection_error"))
+    unknowns = torch.cat([known, known.new_tensor(lines.numbers((BOARD,), (5,)))])
+    return Camera(width, height, half, unknowns, known.new_tensor(root).view(len(UNKNOWNS), -1), noise)
+
+
+class _Lines:
+    """Names in YAML, JSON or XML, each with the words up to the next one; those of `data` are of the matrix before."""
+
+    def __init__(self, file: Path, text: str) -> None:
+        self.what, self.words, self.written = f"file '{file}'", dict[str, list[list[str]]](), dict[str, str]()
+        if text.lstrip().startswith("<"):
+            text = re.sub(r"<(\w+)[^<>]*>", r"\n\1: ", re.sub("<[/!?][^<>]*>", "\n", text))
+        if text.count("[") != text.count("]"):
+            raise InputError.of(self.what, expected=FORMS, got="a list without an end", fix="check the file")
+        parts, matrix = WORD.split(re.sub("#.*", "", text)), ""
+        for name, value in zip(parts[1::2], parts[2::2], strict=True):
+            short = name.rpartition(".")[2].lower().replace("_", "")
+            if short in ("rows", "cols", "dt", "typeid"):
+                continue
+            matrix = short if short != "data" else matrix
+            words = [word for word in re.split(r"[\s,\[\]{}\"'|]+", value) if word.strip("-.") and word[0] != "!"]
+            if words or "[" in value or short == "data":
+                self.written[matrix] = name if name != "data" else self.written.get(matrix, "")
+                self.words.setdefault(matrix, []).append(words)
+
+    def has(self, *names: str) -> bool:
+        """Whether the file has one of these."""
+        return any(name.replace("_", "") in self.words for name in names)
+
+    def numbers(self, names: Sequence[str], counts: Sequence[int]) -> list[float]:
+        """The numbers of the one of these names that the file has."""
+        own = [words for name in names for words in self.words.get(name.replace("_", ""), [])]
+        own = [words for words in own if words != ["0"]] or own  # of a region of interest that is none
+        expected = f"`{names[0]}` of {' or '.join(map(str, counts[:6]))} numbers below {LARGEST:.0e}"
+        if len({tuple(words) for words in own}) > 1:
+            got, fix = f"{len(own)} different ones", "write each camera to a file of its own"
+            raise InputError.of(self.what, expected=f"one {expected}", got=got, fix=fix)
+        words = own[0] if own else []
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) not in counts or not all(abs(value) < LARGEST for value in values):
+            fix = f"write {FORMS}" if names is MATRIX else f"check or add `{names[0]}`"
+            raise InputError.of(self.what, expected=expected, got=few(words) or "none", fix=fix)
+        return values
+
+    def pinhole(self) -> list[float]:
+        """fx, fy, cx, cy, pixels."""
+        if not self.has(*MATRIX) and self.has("fx"):
+            return [self.numbers(CENTRE.get(name, (name,)), (1,))[0] for name in ("fx", "fy", "cx", "cy")]
+        values = self.numbers(MATRIX, (4, 9))
+        if len(values) == 4:
+            return values
+        fx, skew, cx, zero, fy, cy, *last = values
+        if abs(skew) > 1e-6 * abs(fx) or zero or last != [0, 0, 1]:
+            expected, fix = "fx 0 cx, 0 fy cy, 0 0 1", "write it row by row; cameras with skew are not read"
+            raise InputError.of(f"{self.what}, camera matrix", expected=expected, got=few(values, 9), fix=fix)
+        return [fx, fy, cx, cy]
+
+    def distortion(self) -> list[float]:
+        """k1, k2, p1, p2, k3."""
+        lens, other = f"the lens of {self.what}", ""
+        for name, (words, *_) in self.words.items():
+            text = " ".join([self.written[name], *words])
+            if not MODEL_NAMES.search(name) or words[:1] in ([], ["0"], ["false"]):
+                continue
+            if BENT.search(text.lower()):
+                raise InputError.of(lens, expected=READ, got=text, fix="calibrate the camera with this model")
+            if OTHER.search(text.lower()) or (name == "distortionmodel" and words[0].lower() not in MODELS):
+                other = text
+        raw = [word for name in (*DISTORTION, *COEFFICIENTS) for words in self.words.get(name, []) for word in words]
+        if other and any(word.strip("+-0.e") for word in raw):
+            raise InputError.of(lens, expected=READ, got=other, fix="calibrate the camera with this model")
+        if self.has(*DISTORTION):
+            values = self.numbers(DISTORTION, (0, 4, 5, 8, 12, 14))
+        else:
+            values = [self.numbers((name,), (1,))[0] if self.has(name) else 0.0 for name in COEFFICIENTS]
+            if not self.has(*COEFFICIENTS):
+                warn_user(f"{self.what} has no distortion: its lens is read as one without")
+        if any(values[5:]):
+            got = f"coefficients {few(values, 14)}"
+            raise InputError.of(lens, expected=READ, got=got, fix="calibrate the camera with this model")
+        if len(values) == 4 and not self.has("distortion_model"):
+            warn_user(f"{self.what} names no lens: its 4 coefficients are read as k1, k2, p1, p2, not as a fisheye's")
+        return (values + 5 * [0.0])[:5]
+
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images, pixels."""
+        if self.has(*SIZE):
+            width, height = self.numbers(SIZE, (2,))
+        else:
+            width, height = (self.numbers((f"image_{name}", name), (1,))[0] for name in ("width", "height"))
+        return int(width), int(height)
 
 
 def matrix_lines(name: str, rows: int, data: list[float], *, ros: bool = False) -> list[str]:
@@ -82,32 +203,3 @@ def matrix_lines(name: str, rows: int, data: list[float], *, ros: bool = False) 
         *kind,
         f"   data: [{numbers}]",
     ]
-
-
-def _numbers(file: Path, text: str, name: str, count: int | None) -> Tensor:
-    """The numbers of a matrix; of the root those of whole rows."""
-    data = f"\n{text}".partition(f"\n{name}:")[2].partition("data:")[2].lstrip()
-    inside, end, _ = data.partition("]")
-    try:
-        values = [float(word) for word in inside.removeprefix("[").replace(",", " ").split()] if end else []
-    except ValueError:
-        values = []
-    if name == "distortion_coefficients" and len(values) == 4:
-        values.append(0.0)
-    right = len(values) == count if count else values and len(values) % len(UNKNOWNS) == 0
-    if not right or not all(abs(value) < LARGEST for value in values):
-        expected = f"a matrix `{name}` of {count or f'{len(UNKNOWNS)} rows of'} numbers below {LARGEST:.0e}"
-        raise InputError.of(f"file '{file}'", expected=expected, got=f"{len(values)} numbers", fix="check the file")
-    return torch.tensor(values, dtype=torch.float64, device=HOST)
-
-
-def _number(file: Path, text: str, name: str) -> float:
-    word = f"\n{text}".partition(f"\n{name}:")[2].partition("\n")[0].strip()
-    try:
-        value = float(word)
-    except ValueError:
-        value = inf
-    if not 0.0 <= value < LARGEST:
-        expected = f"a line `{name}: NUMBER`, positive and below {LARGEST:.0e}"
-        raise InputError.of(f"file '{file}'", expected=expected, got=repr(word), fix="check the file")
-    return value

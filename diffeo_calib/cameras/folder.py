@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import html
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -14,13 +15,15 @@ import numpy as np
 import torch
 
 from diffeo_calib.cameras.board import BoardPrior
-from diffeo_calib.cameras.detection import Board, opencv, other_dictionary
+from diffeo_calib.cameras.detection import BENT, Board, opencv, other_dictionary, other_layout
 from diffeo_calib.cameras.images import Camera, Images, first_guess
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 
 IMAGE, CAMERA = "image", "camera"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+FLIPPED, KALIBR = ("right-up", "left-down"), " (numbers run upwards, as in grids of Kalibr)"
+"""Orders of grids of markers in which numbers run to the right and upwards, and what is said of them."""
 THUMBNAIL_WIDTH_PX = 320
 """Width of an image in the overview, pixels."""
 Progress = Callable[[str, int, int], None]
@@ -46,6 +49,7 @@ class Folder:
         name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
         images: in the order of the table.
         size: width and height, pixels.
+        paired: how rows and images were, unless the table names these.
     """
 
     name: str
@@ -53,6 +57,7 @@ class Folder:
     header: list[str]
     images: list[Seen]
     size: tuple[int, int]
+    paired: str
 
     @property
     def used(self) -> list[Seen]:
@@ -103,8 +108,8 @@ def read_folders(
     Args:
         folders: of the images, one of each camera.
         joints: a table with a header; its column `image`, or another one of file names of images, names the file of
-            each row, in every folder that has one; without it the rows are those of the files of each folder in
-            alphabetical order.
+            each row, in every folder that has one; without it the rows are those of the files of each folder in the
+            order of the numbers in their names.
         board: to look for. sep: between cells. progress: called as ``progress(task, done, total)``.
 
     Raises:
@@ -119,12 +124,18 @@ def read_folders(
     if CAMERA in header and len(folders) > 1:
         fix = "leave it out: the folders name the cameras"
         raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
-    header, rows, files = _files(folders, joints, header, rows)
-    each = zip(folders, names, files, strict=True)
+    place = _column_of_images(header, rows)
+    if place is None:
+        files = _ordered(folders, joints, len(rows))
+    else:
+        files = _named(folders, [row[place].strip() for row in rows])
+    kept = [k for k in range(len(header)) if k != place]
+    header, rows = [header[k] for k in kept], [[row[k] for k in kept] for row in rows]
     found = []
-    for folder, name, own in each:
+    for folder, name, own in zip(folders, names, files, strict=True):
         whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
-        found.append(_folder(folder, Folder(name, board, header, [], (0, 0)), whole, progress))
+        paired = f"row 1 is {own[0]}, row {len(own)} is {own[-1]}: by the numbers in the names" * (place is None)
+        found.append(_folder(folder, Folder(name, board, header, [], (0, 0), paired), whole, progress))
     return found
 
 
@@ -142,12 +153,18 @@ def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]],
         progress("images", len(images), len(known))
         images.append(_seen(*own, image, board, usual))
     found = replace(empty, images=images, size=(usual[1], usual[0]))
-    if not found.used:
-        reasons = few([f"{one.name}: {one.refused}" for one in images])
-        likely = next((word for image in read[:3] if image is not None and (word := other_dictionary(image))), None)
-        fix = "check the board and the images" if likely is None else f"most markers are of {likely}: check --board"
+    if len(found.used) <= sum(one.refused.startswith(BENT) for one in images):
+        some = [own for own in read if own is not None][:3]
+        layout = other_layout(some, board)
+        likely = None if layout else next(filter(None, map(other_dictionary, some)), None)
+        fix = "check the lengths and numbers of the board, and the images"
+        if layout:
+            fix = f"give the board as {layout}, which explains the corners{KALIBR * layout.endswith(FLIPPED)}"
+        elif likely and likely.rpartition("_")[0] not in board.text.upper():
+            fix = f"most markers are of {likely}: check --board"
         what = f"images of '{folder}' that show {board.text}"
-        raise MeasurementError.of(what, expected="some", got=reasons, fix=fix)
+        got = few([f"{one.name}: {one.refused}" for one in images if one.refused])
+        raise MeasurementError.of(what, expected="some", got=got, fix=fix)
     return found
 
 
@@ -163,29 +180,34 @@ def _table(joints: Path, sep: str) -> tuple[list[str], list[list[str]]]:
     return [cell.strip() for cell in lines[0]], lines[1:]
 
 
-def _files(
-    folders: Sequence[Path], joints: Path, header: list[str], rows: list[list[str]]
-) -> tuple[list[str], list[list[str]], list[list[str | None]]]:
-    """Header and cells without the column of images, and the file of each row in every folder."""
-    place = _column_of_images(header, rows)
-    if place is not None:
-        names = [row[place].strip() for row in rows]
-        files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
-        missing = [name for name, *own in zip(names, *files, strict=True) if not any(own)]
-        if missing:
-            where = " or ".join(f"'{folder}'" for folder in folders)
-            raise MeasurementError.of(f"images in {where}", expected="those of the table", got=f"no {few(missing)}")
-        rows = [row[:place] + row[place + 1 :] for row in rows]
-        return [name for k, name in enumerate(header) if k != place], rows, files
-    found: list[list[str | None]] = []
-    for folder in folders:
-        own = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-        if len(own) != len(rows):
-            got, fix = f"{len(own)} images, {len(rows)} rows", "add a column `image` with the name of each row's file"
-            what = f"'{folder}' and '{joints}'"
-            raise MeasurementError.of(what, expected="an image for each row", got=got, fix=fix)
-        found.append([*own])
-    return header, rows, found
+def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | None]]:
+    """The file of each row in every folder, by its name."""
+    files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
+    missing = [name for name, *own in zip(names, *files, strict=True) if not any(own)]
+    if missing:
+        where = " or ".join(f"'{folder}'" for folder in folders)
+        raise MeasurementError.of(f"images in {where}", expected="those of the table", got=f"no {few(missing)}")
+    return files
+
+
+def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str]]:
+    """The file of each row in every folder, in the order of the numbers in their names: 2.png before 10.png."""
+    files = [
+        sorted((own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES), key=_by_numbers)
+        for folder in folders
+    ]
+    others = [f"{len(own)} in '{folder}'" for folder, own in zip(folders, files, strict=True) if len(own) != count]
+    if others:
+        expected, got = f"{count} images, one for each row of '{joints}'", few(others)
+        fix = "add a column `image` with the name of each row's file"
+        raise MeasurementError.of("images without names in the table", expected=expected, got=got, fix=fix)
+    return files
+
+
+def _by_numbers(name: str) -> list[tuple[str, int]]:
+    """Texts of a name, each with the number behind it, and the name."""
+    parts = re.findall(r"(\D*)(\d*)", name.lower())
+    return [*((text, int(number or -1)) for text, number in parts), (name, 0)]
 
 
 def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:

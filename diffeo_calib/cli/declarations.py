@@ -125,7 +125,7 @@ class CampaignOptions(Command):
 
 @command("record")
 class RecordOptions(Command):
-    """Turn a ROS 2 bag into a table, one row for each stop.
+    """Turn a ROS bag into a table, one row for each stop.
 
     A stop lasts as long as joints and measured places stand still; a row is the mean over it, in m and rad, with the
     standard deviations of what was seen (std_x, ...), its time and the number of readings. The clocks of both may
@@ -135,10 +135,10 @@ class RecordOptions(Command):
     joint values for `images`.
     """
 
-    bag: Path = argument("BAG", "Folder of a ROS 2 bag.")
-    seen: str = option("Stamped points, poses or transforms that a device measured; or images.", "TOPIC", default=...)
+    bag: Path = argument("BAG", "Folder of a ROS 2 bag, or file of a ROS 1 bag.")
+    seen: str = option("Stamped points or poses, /tf:CHILD or '/tf:PARENT>CHILD'; or images.", "TOPIC", default=...)
     output: Path = output("Table to write.", "CSV")
-    joints: str = option("Joint states.", "TOPIC", default="/joint_states")
+    joints: str = option("Joint states; TOPIC:NAME,NAME takes some joints.", "TOPIC", default="/joint_states")
     still: float = option("Largest motion of a joint at a stop.", min=1e-9, default=1e-3)
     shortest: float = option("Shortest stop in seconds.", min=0.01, default=0.5)
     offset: float | None = option(
@@ -200,11 +200,12 @@ class ImagesOptions(Command):
 
     folders: list[Path] = argument("FOLDER", "Folder of the images, or one of each camera.")
     joints: Path = argument(
-        "JOINTS", "Table of joint values, with a column of file names unless rows are in their order."
+        "JOINTS",
+        "Table of joint values, with a column of file names unless rows are in the order of the numbers in these.",
     )
     board: str = option(
         "Its lengths are in m, whatever --length is: charuco:5x7:SQUARE:MARKER:DICT, chessboard:7x5:SQUARE (inner "
-        "corners), aruco:4x5:SIDE:GAP:DICT or tag:SIDE:DICT:NUMBER.",
+        "corners), aruco:4x5:SIDE:GAP:DICT (with :right-up if its numbers run upwards) or tag:SIDE:DICT:NUMBER.",
         "BOARD",
         default=...,
     )

@@ -213,7 +213,7 @@ def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
     if path is None:
         return
     try:
-        _check_place(option, path)
+        check_writable(path)
         for name, other in taken.items():
             same = path.exists() and other.exists() and path.samefile(other)
             if same or os.path.realpath(path) == os.path.realpath(other):
@@ -221,7 +221,6 @@ def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
     except OSError as error:
         what = f"{option} {path} cannot be written ({error.strerror})"
         raise InputError.of(what, fix="name another file") from error
-    check_writable(path)
 
 
 def make_folder(folder: Path) -> None:
@@ -231,15 +230,3 @@ def make_folder(folder: Path) -> None:
     except OSError as error:
         what = f"the folder {folder} cannot be made ({error.strerror})"
         raise InputError.of(what, fix="name another folder") from error
-
-
-def _check_place(option: str, path: Path) -> None:
-    if path.is_dir():
-        expected, fix = "the name of a file", "add a name to it"
-        raise InputError.of(f"{option} {path} is a folder", expected=expected, fix=fix)
-    if not path.parent.is_dir():
-        what = f"{option} {path} cannot be written, there is no folder {path.parent}"
-        raise InputError.of(what, fix="make it first, or name a file in another folder")
-    if path.exists() and not os.access(path, os.W_OK):
-        what = f"{option} {path} cannot be written: permission denied"
-        raise InputError.of(what, fix="name a file in a folder that you may write to")

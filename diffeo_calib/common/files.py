@@ -170,7 +170,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         if path.is_dir():
             raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
         special = path.exists() and not path.is_file()
-        if special and not os.access(path, os.W_OK):
+        if path.exists() and not os.access(path, os.W_OK):
             raise OSError(errno.EACCES, os.strerror(errno.EACCES))
     if not special:  # opening a pipe would wait for its reader
         with WholeFile(path) as file:

@@ -1,57 +1,147 @@
-"""ROS 2 bags: joint states and what a device saw, by the times in their headers. Needs the package rosbags."""
+"""ROS bags: joint states and what a device saw, by the times in their headers. Needs the package rosbags."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from diffeo_calib.cameras.detection import opencv
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
+from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.stops import Array, Recording
+from diffeo_calib.robots.se3 import transforms
 
+KINDS = "PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped, Odometry, TFMessage or images"
+"""Messages of what a device saw."""
 PLACES = ("point", "pose.position", "pose.pose.position", "transform.translation")
 TURNS = ("pose.orientation", "pose.pose.orientation", "transform.rotation")
 """Where messages of geometry_msgs with a header hold places and rotations."""
+QUATERNION = "quat_xyzw"
 CHANNELS = {"mono8": [0], "8UC1": [0], "bgr8": [0, 1, 2], "8UC3": [0, 1, 2], "rgb8": [2, 1, 0]}
 """Encodings of sensor_msgs/Image: where a pixel has its grey value, or blue, green and red."""
 SUFFIXES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"II*\0": ".tif", b"MM\0*": ".tif"}
 """First bytes of compressed images that `images` reads."""
+_Rows = list[list[float]]
+"""Times, s, each with values."""
+_Edge = tuple[str, str]
+"""Parent and child of a transform."""
 
 
 def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], Recording]:
     """Two topics of a bag.
 
+    Joints are joined by their names over all messages and publishers: each has the times of the messages that hold it,
+    between which its values are interpolated.
+
     Args:
-        joints: topic of sensor_msgs/JointState. seen: of geometry_msgs, stamped points, poses or transforms; or images.
+        joints: topic of sensor_msgs/JointState, or TOPIC:NAME,NAME for some of its joints.
+        seen: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
+            whose motion was measured: TOPIC:CHILD, or TOPIC:PARENT>CHILD for two frames that transforms join.
 
     Returns:
         joint values (T, n), rad or m, and the joints' names; places (T, 3), m, with unit quaternions (T, 7) if there
         are any, or (T, 0) for images.
 
     Raises:
-        InputError: rosbags is missing, or the bag cannot be read. MeasurementError: topics that it does not have, or
-            that hold something else.
+        InputError: rosbags is missing, or the bag cannot be read. MeasurementError: topics, joints or frames that it
+            does not have, or topics that hold something else.
     """
-    states, places, names = [], [], list[str]()
-    for topic, message in _messages(bag, (joints, seen)):
-        time = _time(message, topic)
-        if topic == seen:
-            places.append([time, *_place(message, seen)])
+    (joints, _, wanted), (seen, _, frames) = (words.partition(":") for words in (joints, seen))
+    states, edges, fixed = dict[str, _Rows](), dict[_Edge, _Rows](), set[_Edge]()
+    places: _Rows = []
+    for topic, message in _messages(bag, (joints, seen), f"{seen}_static"):
+        if topic == joints != seen:
+            _add_joints(states, message, topic)
             continue
-        if not hasattr(message, "position"):
-            expected = "sensor_msgs/JointState"
-            raise MeasurementError.of(f"messages of {joints}", expected=expected, got=type(message).__name__)
-        names = names or list(message.name)
-        if names != list(message.name):
-            raise MeasurementError.of(f"{joints}: joint states of {few(names)} and of {few(message.name)}")
-        if len(message.position) != len(names):
-            got = str(len(message.position))
-            raise MeasurementError.of(f"positions in {joints}", expected=f"{len(names)} joints", got=got)
-        states.append([time, *message.position])
-    return _recording(states, joints), names, _recording(places, seen)
+        for one in getattr(message, "transforms", ()):
+            edge = one.header.frame_id.strip("/"), one.child_frame_id.strip("/")
+            edges.setdefault(edge, []).append([_time(one, seen), *_place(one, seen)])
+            fixed |= {edge} if topic != seen else set()
+        if not hasattr(message, "transforms"):
+            places.append([_time(message, topic), *_place(message, topic)])
+    known, names = _joined(states, [word.strip() for word in wanted.split(",") if word.strip()], joints)
+    if frames and not edges:
+        raise MeasurementError.of(f"frames of {seen}", expected="transforms (TFMessage)", fix=f"write --seen {seen}")
+    return known, names, _moving(edges, fixed, frames, seen) if edges else _recording(places, seen)
+
+
+def _add_joints(states: dict[str, _Rows], message: Any, topic: str) -> None:
+    """Add the time and value of each joint of a message; one without positions holds none."""
+    if not hasattr(message, "position"):
+        expected = "sensor_msgs/JointState"
+        raise MeasurementError.of(f"messages of {topic}", expected=expected, got=message.__msgtype__)
+    if len(message.position) not in (0, len(message.name)):
+        got = str(len(message.position))
+        raise MeasurementError.of(f"positions in {topic}", expected=f"{len(message.name)} joints", got=got)
+    time = _time(message, topic)
+    for name, value in zip(message.name, message.position, strict=False):
+        if np.isfinite(value):
+            states.setdefault(name, []).append([time, value])
+
+
+def _joined(states: Mapping[str, _Rows], wanted: list[str], topic: str) -> tuple[Recording, list[str]]:
+    """All joints, or those wanted, at the times of the one in most messages, where messages of all of them span them.
+
+    Unless it is wanted, a joint whose messages span less than half of the time is left out with a warning.
+    """
+    missing = [name for name in wanted if name not in states]
+    if missing:
+        what, got = f"joints of {topic}", few([*states], 20)
+        raise MeasurementError.of(what, expected=few(missing), got=got, fix="name joints that its messages hold")
+    spans = {name: (min(rows)[0], max(rows)[0]) for name, rows in states.items()}
+    longest = max((last - first for first, last in spans.values()), default=0.0)
+    names = wanted or [name for name, (first, last) in spans.items() if 2 * (last - first) >= longest]
+    left = [name for name in states if name not in names]
+    if left and not wanted:
+        warn_user(f"joints left out, because messages of {topic} hold them for less than half of the time: {few(left)}")
+    first, last = (edge(spans[name][k] for name in names) if names else 0.0 for k, edge in enumerate((max, min)))
+    most = max((states[name] for name in names), key=len, default=[])
+    times: Array = np.array(sorted(time for time, _ in most if first <= time <= last))
+    parts = [np.interp(times, *np.array(sorted(states[name])).T) for name in names]
+    return _recording(np.column_stack([times, *parts]).tolist(), topic), names
+
+
+def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str, topic: str) -> Recording:
+    """The motion of a frame in its parent, or in any frame to which transforms join it, at times of the rarest."""
+    parent, _, child = (word.strip().strip("/") for word in frames.rpartition(">"))
+    parents = [parent] if parent else [one for one, other in edges if other == child]
+    paths = [path for one in parents if (path := _path(edges, one, child))]
+    moved = [edge for edge, _ in paths[0] if edge not in fixed] if len(paths) == 1 else []
+    if not moved:
+        expected = f"one moving frame, as --seen '{topic}:CHILD' or '{topic}:PARENT>CHILD'"
+        got = f"{frames or 'none'} of {few(['>'.join(edge) for edge in edges if edge not in fixed], 20)}"
+        raise MeasurementError.of(f"the frame in {topic}", expected=expected, got=got)
+    tables = {edge: _recording(edges[edge], f"{'>'.join(edge)} in {topic}") for edge in moved}
+    first, last = max(one.times[0] for one in tables.values()), min(one.times[-1] for one in tables.values())
+    times = min((one.times for one in tables.values()), key=len)
+    times = times[(times >= first) & (times <= last)]
+    whole = torch.eye(4, dtype=torch.float64, device=HOST)
+    for edge, forward in paths[0]:
+        own = np.tile(edges[edge][-1][1:], (len(times), 1)) if edge not in tables else tables[edge].at(times)
+        places, turns = torch.from_numpy(own).split([3, 4], 1)
+        one = transforms(rotation_matrices(turns / turns.norm(dim=1, keepdim=True), QUATERNION), places)
+        whole = whole @ (one if forward else torch.linalg.inv(one))
+    turns = rotation_numbers(whole[:, :3, :3], QUATERNION)
+    return _recording(np.column_stack([times, whole[:, :3, 3], turns]).tolist(), topic)
+
+
+def _path(edges: Collection[_Edge], parent: str, child: str) -> list[tuple[_Edge, bool]]:
+    """The fewest transforms from one frame to another, each with whether it is taken from parent to child."""
+    paths, waiting = {parent: list[tuple[_Edge, bool]]()}, deque([parent])
+    while waiting:
+        at = waiting.popleft()
+        for edge in edges:
+            for here, there in (edge, edge[::-1]):
+                if here == at and there not in paths:
+                    paths[there] = [*paths[at], (edge, here == edge[0])]
+                    waiting.append(there)
+    return paths.get(child, [])
 
 
 def read_images(bag: Path, topic: str, times: Collection[float]) -> Iterator[tuple[float, str, bytes]]:
@@ -70,7 +160,7 @@ def read_images(bag: Path, topic: str, times: Collection[float]) -> Iterator[tup
                 continue
             suffix = next((suffix for first, suffix in SUFFIXES.items() if content.startswith(first)), None)
             if suffix is None:
-                got = str(getattr(message, "format", type(message).__name__))
+                got = str(getattr(message, "format", message.__msgtype__))
                 raise MeasurementError.of(f"images of {topic}", expected=f"one of {few([*SUFFIXES.values()])}", got=got)
             yield time, suffix, content
 
@@ -89,7 +179,7 @@ def _png(message: Any, content: bytes, topic: str) -> bytes:
     return opencv().imencode(".png", pixels)[1].tobytes()
 
 
-def _messages(bag: Path, wanted: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterator[tuple[str, Any]]:
     """Topic and content of the messages of some topics."""
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
@@ -104,11 +194,13 @@ def _messages(bag: Path, wanted: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
             if missing:
                 expected = f"one of {few(topics)}" if topics else "topics with messages"
                 raise MeasurementError.of(f"{bag}: no topic {few(missing)}", expected=expected)
-            connections = [one for one in reader.connections if one.topic in wanted]
+            connections = [one for one in reader.connections if one.topic in (*wanted, optional)]
             for one, _, raw in reader.messages(connections=connections):
                 yield one.topic, reader.deserialize(raw, one.msgtype)
     except (OSError, AnyReaderError) as error:
-        raise InputError.of(f"{bag} cannot be read", expected="a ROS 2 bag", got=str(error)) from error
+        expected = "the folder of a ROS 2 bag, with metadata.yaml, or a ROS 1 file"
+        fix = "give the file of a ROS 1 bag, with a name that ends in .bag, or convert it with rosbags-convert"
+        raise InputError.of(f"{bag} cannot be read", expected=expected, got=str(error), fix=fix) from error
 
 
 def _time(message: Any, topic: str) -> float:
@@ -116,7 +208,7 @@ def _time(message: Any, topic: str) -> float:
     header = getattr(message, "header", None)
     if header is None:
         fix = "record the stamped kind of message"
-        raise MeasurementError.of(f"messages of {topic}", expected="a header", got=type(message).__name__, fix=fix)
+        raise MeasurementError.of(f"messages of {topic}", expected=KINDS, got=message.__msgtype__, fix=fix)
     return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
@@ -126,8 +218,7 @@ def _place(message: Any, topic: str) -> list[float]:
         return []
     place = next(filter(None, (_part(message, path) for path in PLACES)), None)
     if place is None:
-        expected = "stamped points, poses or transforms of geometry_msgs, or images"
-        raise MeasurementError.of(f"messages of {topic}", expected=expected, got=type(message).__name__)
+        raise MeasurementError.of(f"messages of {topic}", expected=KINDS, got=message.__msgtype__)
     turn = next(filter(None, (_part(message, path) for path in TURNS)), None)
     return [place.x, place.y, place.z] + ([] if turn is None else [turn.x, turn.y, turn.z, turn.w])
 
@@ -139,7 +230,8 @@ def _part(message: Any, path: str) -> Any:
 
 
 def _recording(rows: list[list[float]], topic: str) -> Recording:
-    """Rows (time, values) in the order of time; quaternions with one sign."""
+    """Rows (time, values) of numbers in the order of time; quaternions with one sign."""
+    rows = [row for row in rows if np.isfinite(row).all()]
     if len(rows) < 3:
         raise MeasurementError.of(f"messages of {topic}", expected="at least 3", got=str(len(rows)))
     table: Array = np.array(sorted(rows))

@@ -22,6 +22,8 @@ NOISE_FACTOR = 8.0
 """Range of the noise within a window, in standard deviations, that is no motion."""
 STEP_S = 0.01
 """Of the grid on which both recordings are compared."""
+SAME_TURN = 1e-9
+"""Range of a quaternion's numbers at all stops that is rounding."""
 FEWEST_CHANGES = 4
 """Beginnings and ends of motions that tell how far the clocks differ."""
 
@@ -58,6 +60,10 @@ class Recording:
         last = np.searchsorted(self.times, self.times + 0.5 * window, "right")
         found = [np.ptp(self.values[a:b], axis=0).max() for a, b in zip(first, last, strict=True)]
         return np.array(found) <= tolerance
+
+    def at(self, times: Array) -> Array:
+        """Values (T, d) at other times, s."""
+        return np.stack([np.interp(times, self.times, values) for values in self.values.T], 1)
 
     @property
     def noise(self) -> float:
@@ -107,16 +113,19 @@ def stops(
             middle = 0.5 * (begin + end), joints.values[here].mean(0), values.mean(0)
             found.append(Stop(*middle, values.std(0, ddof=1), len(values)))
     if not found:
-        fix = "record for longer, or allow larger motions"
+        fix = "record for longer, allow larger motions, or leave out joints that never rest"
         raise MeasurementError.of("stops", expected="some", got="none in which both recordings stand still", fix=fix)
     return found, offset
 
 
 def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float]]:
-    """The rows of stops: column -> value, in s, m and rad; ``names`` of the joints."""
-    rows = []
+    """The rows of stops: column -> value, in s, m and rad; ``names`` of the joints.
+
+    Without rotations where they never change: a device that measures none writes such.
+    """
+    rows, changes = [], (np.ptp([one.seen[3:] for one in found], axis=0) > SAME_TURN).any()
     for one in found:
-        turn = one.seen[3:] / np.linalg.norm(one.seen[3:])
+        turn = one.seen[3:] / np.linalg.norm(one.seen[3:]) if changes else one.seen[:0]
         columns = ["time", *names, *PLACE, *TURN[: len(turn)], *(f"std_{axis}" for axis in PLACE), "readings"]
         numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
         rows.append(dict(zip(columns, [*map(float, numbers), one.count], strict=True)))

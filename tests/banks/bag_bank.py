@@ -11,6 +11,7 @@ import pytest
 
 JOINTS, PLACES, PICTURES = "/joint_states", "/at", "/camera"
 STATE, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
+FRAMES = "tf2_msgs/msg/TFMessage"
 RAW, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 
@@ -39,10 +40,23 @@ class Bag:
         self.add(JOINTS, STATE, [(t, (names, row, nothing, nothing)) for t, row in zip(times, q, strict=True)])
 
     def poses(self, times: np.ndarray, p: np.ndarray) -> None:
-        """Places with a quaternion whose sign, which has no meaning, changes."""
+        """Places, turned about z by x rad, with quaternions whose sign, which has no meaning, changes."""
         point, turn, pose = (self.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Pose"))
-        each = zip(times, p, strict=True)
-        self.add(PLACES, POSE, [(t, (pose(point(*at), turn(0, 0, (-1.0) ** k, 0)),)) for k, (t, at) in enumerate(each)])
+        turns = (-1.0) ** np.arange(len(p))[:, None] * np.stack([np.sin(p[:, 0] / 2), np.cos(p[:, 0] / 2)], 1)
+        each = zip(times, p, turns, strict=True)
+        self.add(PLACES, POSE, [(t, (pose(point(*at), turn(0, 0, *own)),)) for t, at, own in each])
+
+    def frames(self, topic: str, times: np.ndarray, parent: str, child: str, poses: np.ndarray) -> None:
+        """Transforms (T, 7), place and quaternion x y z w, of a frame in its parent."""
+        vector, turn, transform = (
+            self.types[f"geometry_msgs/msg/{name}"] for name in ("Vector3", "Quaternion", "Transform")
+        )
+        stamped, message = self.types["geometry_msgs/msg/TransformStamped"], self.types[FRAMES]
+        own = self.topics.setdefault(topic, (FRAMES, []))[1]
+        for time, row in zip(times, poses, strict=True):
+            header = self.header(time)
+            header.frame_id = parent
+            own.append((time, message([stamped(header, child, transform(vector(*row[:3]), turn(*row[3:])))])))
 
     def images(self, times: Iterable[float], pixels: np.ndarray, encoding: str) -> None:
         """The same raw image (H, W, channels) at several times; each row ends with two bytes that belong to none."""

@@ -18,7 +18,7 @@ cv2 = pytest.importorskip("cv2")
 
 from rendered_board import BOARD, rendered, texture  # noqa: E402
 
-from diffeo_calib.cameras.detection import Board  # noqa: E402
+from diffeo_calib.cameras.detection import Board, misfit, other_layout  # noqa: E402
 from diffeo_calib.cameras.folder import read_folders  # noqa: E402
 
 FOUND = Board.of(BOARD)
@@ -82,6 +82,81 @@ def test_other_boards_are_found(text: str, corners: int) -> None:
 def test_other_texts_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="board"):
         Board.of(text)
+
+
+def seen_grid(text: str, number: int = 0, squares: bool = False) -> np.ndarray:
+    """A grid of markers seen at an angle, with squares between the corners of its markers as those of Kalibr have."""
+    board = Board.of(text)
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, text.split(":")[4]))
+    scale = 800 / float(np.ptp(board.points[:, 0]))
+    low = np.min([c.min(0) for c in board.layout.values()], 0)
+    corners = {k: np.rint(scale * (c - low)[:, :2]).astype(int) + 100 for k, c in board.layout.items()}
+    sheet = np.full((*(np.max([c.max(0) for c in corners.values()], 0) + 100)[::-1],), 255, np.uint8)
+    gap = round(scale * float(text.split(":")[3]))
+    for k, c in corners.items():
+        (x, y), side = c.min(0), int(np.ptp(c[:, 0]))
+        sheet[y : y + side, x : x + side] = cv2.aruco.generateImageMarker(markers, k, side)
+        for column, row in ((x - gap, y - gap), (x + side, y - gap), (x - gap, y + side), (x + side, y + side)):
+            if squares:
+                sheet[row : row + gap, column : column + gap] = 0
+    high, wide = sheet.shape
+    frame = np.array([[0, 0], [wide, 0], [wide, high], [0, high]], np.float32)
+    moved = np.random.default_rng(number).uniform(-40, 40, (4, 2))
+    H = cv2.getPerspectiveTransform(frame, (frame * min(1000 / wide, 760 / high) + 80 + moved).astype(np.float32))
+    small = cv2.warpPerspective(sheet, H, (1160, 920), flags=cv2.INTER_AREA, borderValue=255)
+    return cv2.GaussianBlur(small, (0, 0), 0.7)
+
+
+GRID = "aruco:{}:0.05:0.015:DICT_5X5_250{}"
+
+
+@pytest.mark.parametrize(
+    ("real", "said"),
+    [
+        (GRID.format("5x4", ":0:right-up"), GRID.format("5x4", "")),
+        (GRID.format("4x5", ":0:right-down"), GRID.format("5x4", "")),
+        (GRID.format("3x4", ":0:down-right"), GRID.format("3x4", "")),
+        (GRID.format("4x3", ":30:left-up"), GRID.format("4x3", "")),
+        (GRID.format("4x3", ":2:right-down"), GRID.format("4x3", "")),
+    ],
+)
+def test_another_layout_is_refused_and_named(real: str, said: str) -> None:
+    image = seen_grid(real)
+    with pytest.raises(InputError, match=r"no plane explains, by \d+\.\d px|got none"):
+        Board.of(said).corners(image)
+    assert other_layout([image], Board.of(said)) == real
+    own = Board.of(real)
+    numbers, pixels = own.corners(image)
+    assert len(numbers) == len(own.points)
+    assert misfit(own.points[numbers], pixels, image)[0] < 0.5
+
+
+def test_corners_of_markers_that_touch_squares_are_exact() -> None:
+    own = Board.of("aruco:4x3:0.04:0.012:DICT_APRILTAG_36h11:0:right-up")
+    image = cv2.resize(seen_grid(own.text, 1, squares=True), None, fx=0.45, fy=0.45, interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(image, (0, 0), 0.8)
+    rough, corners = own.markers(image)
+    points = np.concatenate([own.layout[number] for number in rough.tolist()])
+    assert misfit(points, corners.reshape(-1, 2), image)[0] > 2
+    numbers, pixels = own.corners(image)
+    assert misfit(own.points[numbers], pixels, image)[0] < 0.2
+
+
+def test_a_wide_lens_is_no_other_layout() -> None:
+    own = Board.of(GRID.format("4x3", ":0:right-down"))
+    image = seen_grid(own.text, 2)
+    matrix = np.array([[700.0, 0, 580], [0, 700, 460], [0, 0, 1]])
+    columns, rows = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
+    pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)[:, None]
+    places = cv2.undistortPoints(pixels, matrix, np.array([-0.3, 0.1, 0, 0]), P=matrix).reshape(*image.shape, 2)
+    bent = cv2.remap(image, places.astype(np.float32), None, cv2.INTER_LINEAR, borderValue=255)
+    numbers, pixels = own.corners(bent)
+    assert len(numbers) == len(own.points)
+    flat = np.column_stack([own.points[numbers][:, :2], np.ones(len(numbers))])
+    straight = flat @ cv2.findHomography(own.points[numbers][:, :2], pixels)[0].T
+    assert np.abs(straight[:, :2] / straight[:, 2:] - pixels).max() > 5, "far from a plane without the lens"
+    with pytest.raises(InputError, match="no plane"):
+        Board.of(GRID.format("4x3", ":0:right-up")).corners(bent)
 
 
 # --- reasons --------------------------------------------------------------------------------------------------------
@@ -158,11 +233,35 @@ def test_another_dictionary_is_named(folder: Path) -> None:
 def test_images_without_rows_are_refused(folder: Path) -> None:
     table = folder / "joints.csv"
     table.write_text("q1,q2\n1,2\n3,4\n")
-    with pytest.raises(MeasurementError, match="5 images, 2 rows"):
+    with pytest.raises(MeasurementError, match=r"2 images.*got 5 in"):
         read_folders([folder], table, FOUND)
     table.write_text("image,q1\nmissing.png,2\n")
     with pytest.raises(MeasurementError, match=r"missing\.png"):
         read_folders([folder], table, FOUND)
+
+
+def test_unnamed_images_are_paired_by_the_numbers_in_their_names(tmp_path: Path, command: Command) -> None:
+    (tmp_path / "cam").mkdir()
+    for name, number in (("img10.png", 2), ("img2.png", 1), ("Img1.png", 0)):
+        cv2.imwrite(str(tmp_path / "cam" / name), image(number))
+    table, out = tmp_path / "joints.csv", tmp_path / "corners.csv"
+    table.write_text("q1\n1\n2\n10\n")
+    done = command("images", tmp_path / "cam", table, "--board", BOARD, "--length", "mm", "-o", out)
+    assert done.code == 0, done.err
+    assert "row 1 is Img1.png, row 3 is img10.png" in done.out
+    pairs = {tuple(line.split(",")[:2]) for line in out.read_text().splitlines()[1:]}
+    assert pairs == {("Img1.png", "1"), ("img2.png", "2"), ("img10.png", "10")}
+
+
+def test_a_folder_of_another_layout_is_refused_with_the_fix(tmp_path: Path, command: Command) -> None:
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), seen_grid(GRID.format("4x3", ":0:right-up"), number))
+    table = tmp_path / "joints.csv"
+    table.write_text("q1\n1\n2\n")
+    said = "--board", GRID.format("4x3", ""), "--length", "mm", "-o", tmp_path / "corners.csv"
+    done = command("images", tmp_path, table, *said)
+    assert done.code == 1
+    assert all(word in done.err for word in (" px", GRID.format("4x3", ":0:right-up"), "Kalibr")), done.err
 
 
 def test_any_column_of_file_names_pairs_rows_with_images(folder: Path) -> None:

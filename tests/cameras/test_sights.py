@@ -17,7 +17,7 @@ from torch.testing import assert_close
 from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
 
 NOISE = 0.2
@@ -178,7 +178,72 @@ def test_files_of_ros_hold_a_lens(tmp_path: Path) -> None:
     assert (found.half_size, found.root.shape) == (0.0, (len(UNKNOWNS), 0))
 
 
+NINE, FIVE = "500.0, 0.0, 310.0, 0.0, 510.0, 235.0, 0.0, 0.0, 1.0", "-0.1, 0.02, 0.001, -0.0002, 0.0"
+ECHO = "height: 480\nwidth: 640\ndistortion_model: {}\nD: [{}]\nK: [" + NINE + "]\nroi:\n  height: 0\n  width: 0\n"
+KALIBR = "cam0:\n  camera_model: {}\n  distortion_coeffs: [{}]\n  distortion_model: {}\n  resolution: [640, 480]\n"
+CHAIN = KALIBR.format("pinhole", FIVE[:-5], "radtan") + "  intrinsics: [500.0, 510.0, 310.0, 235.0]\n"
+STORAGE = "%YAML:1.0\n---\nimage_size: [ 640, 480 ]\nK: !!opencv-matrix\n   rows: 3\n   data: [ " + NINE + " ]\n"
+LENSES = {
+    "topic echo of ROS 1": ECHO.format("plumb_bob", FIVE),
+    "eight coefficients without the last three": ECHO.format("rational_polynomial", FIVE + ", 0.0, 0.0, 0.0"),
+    "topic echo of ROS 2": "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd:\n- {}\nk:\n- {}\n---\n".format(
+        *(numbers.replace(", ", "\n- ") for numbers in (FIVE, NINE))
+    ),
+    "Kalibr": CHAIN,
+    "OpenCV": STORAGE + "D: !!opencv-matrix\n   rows: 1\n   dt: d\n   data: [ " + FIVE + " ]\nfisheye_model: 0\n",
+    "XML": "<?xml version='1.0'?>\n<opencv_storage><image_Width>640</image_Width><image_Height>480</image_Height>"
+    f"<Camera_Matrix type_id='opencv-matrix'><rows>3</rows><data>{NINE}</data></Camera_Matrix>"
+    f"<Distortion_Coefficients><data>\n{FIVE}</data></Distortion_Coefficients></opencv_storage>".replace(",", ""),
+    "plain": "fx: 500\nfy: 510\ncx: 310\ncy: 235\nk1: -0.1  # of a fit\nk2: 0.02\np1: 0.001\np2: -0.0002\n"
+    "width: 640\nheight: 480",
+    "JSON": '{"width":640,"height":480,"fx":500.0,"fy":510.0,"ppx":310,"ppy":235,"model":"brown","coeffs":['
+    + FIVE
+    + "]}",
+}
+REFUSED = {
+    "fisheye of ROS": (ECHO.format("equidistant", FIVE[:-5]), "equidistant"),
+    "fisheye of OpenCV": (STORAGE + f"fisheye_model: 1\nD: [{FIVE[:-5]}]\n", "fisheye_model 1"),
+    "omni": (KALIBR.format("omni", FIVE[:-5], "radtan") + "  intrinsics: [1.2, 500, 510, 310, 235]", "omni"),
+    "double sphere": (KALIBR.format("ds", "", "none") + "  intrinsics: [-0.2, 0.6, 500, 510, 310, 235]", "ds"),
+    "KannalaBrandt8": ("Camera.type: 'KannalaBrandt8'\nCamera.fx: 500.\nCamera.k1: 0.1\n", "KannalaBrandt8"),
+    "division": (ECHO.format("division", "-0.2"), "division"),
+    "rational": (ECHO.format("rational_polynomial", FIVE + ", 0.1, 0.0, 0.0"), "0.1, 0.0, 0.0"),
+    "two cameras": (CHAIN + CHAIN.replace("-0.1", "-0.2"), "2 different"),
+    "columns": (ECHO.format("plumb_bob", FIVE).replace(NINE, "500, 0, 0, 0, 510, 0, 310, 235, 1"), "row by row"),
+    "no size": (STORAGE.replace("image_size", "size") + f"D: [{FIVE}]\n", "image_width"),
+    "no lens": ("a: [1, 2]\nimage_width: 3\nimage_height: 3\nd: [0, 0, 0, 0]", r"`camera_matrix`.*`k`.*Kalibr.*fx"),
+}
+
+
+@pytest.mark.parametrize("form", LENSES)
+def test_usual_files_of_cameras_are_read(form: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(LENSES[form])
+    found = read_camera(path)
+    assert (found.width, found.height) == (640, 480)
+    assert found.lens.tolist() == [500.0, 510.0, 310.0, 235.0, -0.1, 0.02, 0.001, -0.0002, 0.0]
+
+
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
+@pytest.mark.parametrize("form", REFUSED)
+def test_other_lenses_are_refused_by_name(form: str, tmp_path: Path) -> None:
+    text, message = REFUSED[form]
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_camera(path)
+
+
+def test_lenses_that_files_leave_open_are_said(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    for text, message in ((f"D: [{FIVE[:-5]}]\n", "not as a fisheye"), ("", "no distortion")):
+        path.write_text(STORAGE + text)
+        with pytest.warns(DiffeoCalibWarning, match=message):
+            read_camera(path)
+
+
 @pytest.mark.parametrize("text", ["", "image_width: 10\nimage_height: 5\n", "camera_matrix:\n  data: [1, x]\n"])
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
 def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
@@ -194,12 +259,13 @@ DAMAGED = {
     "no row of the root": (r"root:(.*)data: \[[^,]*, ", r"root:\1data: [", "root"),
     "no root": (r"root:(.*)data: \[.*\]", r"root:\1data: []", "root"),
     "a matrix without an end": (r"\]", "", "camera_matrix"),
-    "a number beyond all cameras": (r"data: \[", "data: [1e300, ", "camera_matrix"),
+    "a number beyond all cameras": (r"data: \[", "data: [1e300, ", "distortion_coefficients"),
     "no text": (r"camera_matrix", "\udcff", "utf-8"),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGED)
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
 def test_damaged_files_are_refused(damage: str, tmp_path: Path) -> None:
     pattern, other, message = DAMAGED[damage]
     path = tmp_path / "camera.yaml"
@@ -209,6 +275,7 @@ def test_damaged_files_are_refused(damage: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("piece", ["camera_matrix:\n", "camera_matrix:\n data: [", " "])
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
 def test_long_files_are_refused_at_once(piece: str, tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text("camera_matrix:" + piece * (900_000 // len(piece)))

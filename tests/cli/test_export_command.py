@@ -146,8 +146,8 @@ def test_wrong_robots_and_places(path: Path, site: Site, command: Command, tmp_p
     for target, words in (
         (other, "is the file of --robot"),
         (path, "is the file of MODEL"),
-        (tmp_path, "is a folder"),
-        (tmp_path / "none" / "new.urdf", "there is no folder"),
+        (tmp_path, "cannot be written"),
+        (tmp_path / "none" / "new.urdf", "make its folder first"),
     ):
         done = command("export", path, "--urdf", target, "--robot", other)
         assert done.code == 1

@@ -111,7 +111,7 @@ def test_the_version_is_that_of_the_installation(command: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    ("output", "message"), [("none/model", "there is no folder"), ("model", "no file t.csv; check")]
+    ("output", "message"), [("none/model", "make its folder first"), ("model", "no file t.csv; check")]
 )
 def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_path: Path) -> None:
     fit = ["fit", "t.csv", "--robot", "r.urdf", "--base", "a", "--tip", "b", "--position", "x,y,z"]

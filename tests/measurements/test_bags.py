@@ -1,4 +1,4 @@
-"""Bags of ROS 2 as tables of stops, and as images with their joint values. Skipped without rosbags."""
+"""Bags of ROS as tables of stops, and as images with their joint values. Skipped without rosbags."""
 
 from __future__ import annotations
 
@@ -54,8 +54,101 @@ def test_a_bag_becomes_a_table(bag: Bag, tmp_path: Path, command: Command) -> No
     found = np.array([[float(row[name]) for name in NAMES] for row in table])
     np.testing.assert_allclose(found, PLACES_RAD, rtol=0, atol=5e-4)
     np.testing.assert_allclose([[float(row[k]) for k in "xyz"] for row in table], place(found), rtol=0, atol=1e-4)
-    assert [abs(float(table[0][name])) for name in ("qx", "qy", "qz", "qw")] == [0, 0, 1, 0]
+    turns = [[float(row[name]) for name in ("qx", "qy", "qz", "qw")] for row in table]
+    halves = np.cos(found[:, 0]) / 2
+    whole = np.stack([0 * halves, 0 * halves, np.sin(halves), np.cos(halves)], 1)
+    np.testing.assert_allclose(np.abs((turns * whole).sum(1)), 1, rtol=0, atol=1e-6)
     assert int(table[0]["readings"]) > 50
+
+
+def test_joints_are_joined_by_name(tmp_path: Path, command: Command, bag: Bag) -> None:
+    times, q = motion(40)
+    apart, alone = Bag(), Bag()
+    for k, time in enumerate(times):  # in another order each time, and a gripper beside the arm
+        order = [1, 0] if k % 2 else [0, 1]
+        apart.joints(times[k : k + 1], q[k : k + 1, order], [NAMES[own] for own in order])
+        apart.joints(np.array([time + 0.003]), np.array([[0.4]]), ["claw"])
+        for own in (0, 1):
+            alone.joints(np.array([time + 0.004 * own]), q[k : k + 1, [own]], [NAMES[own]])
+    apart.joints(times[:9], np.zeros((9, 1)), ["lamp"])
+    for made, more in ((apart, ["--joints", f"{JOINTS}:{','.join(NAMES)}"]), (apart, []), (alone, [])):
+        made.topics.pop(PLACES, None)
+        made.poses(times, place(q))
+        name = f"{len(made.topics[JOINTS][1])}{len(more)}"
+        done = command("record", made.write(tmp_path / name), "--seen", PLACES, "-o", tmp_path / "run.csv", *more)
+        assert done.code == 0, done.err
+        table = rows(tmp_path / "run.csv")
+        np.testing.assert_allclose([[float(row[k]) for k in NAMES] for row in table], PLACES_RAD, rtol=0, atol=5e-4)
+        assert ("claw" in table[0]) == (made is apart and not more)
+        assert "lamp" not in table[0]
+        assert ("left out" in done.err and "lamp" in done.err) == ("claw" in table[0])
+    path = tmp_path / name
+    done = command("record", path, "--seen", PLACES, "-o", tmp_path / "no.csv", "--joints", f"{JOINTS}:a,elbow")
+    assert done.code == 1
+    assert "expected elbow, got a, b" in done.err
+
+
+def test_frames_are_chained(tmp_path: Path, command: Command, bag: Bag) -> None:
+    times, q = motion(50)
+    level, moved = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(times), 1)), place(q)
+    poses = np.concatenate([moved, level[:, 3:]], 1)
+    half = np.array([[0.1, 0.2, 0.3, 0.0, 0.0, 0.5**0.5, 0.5**0.5]])  # a quarter turn about z
+    bag.frames("/tf", times, "camera", "/ball", poses)
+    bag.frames("/tf", times[::3], "/world", "lift", level[::3])
+    bag.frames("/tf_static", times[:1], "lift", "camera", half)
+    path = bag.write(tmp_path / "bag")
+    turned = np.stack([-moved[:, 1], moved[:, 0], moved[:, 2]], 1) + half[:, :3]
+    for frames, expected in (
+        ("ball", moved),
+        ("/camera>ball", moved),
+        ("world>/ball", turned),
+        ("ball>camera", -moved),
+    ):
+        done = command("record", path, "--seen", f"/tf:{frames}", "-o", tmp_path / "run.csv")
+        assert done.code == 0, done.err
+        assert "without rotations" in done.out
+        found = np.array([[float(row[k]) for k in "xyz"] for row in rows(tmp_path / "run.csv")])
+        stands = np.array([expected[np.abs(times - middle).argmin()] for middle in MIDDLES])
+        np.testing.assert_allclose(found, stands, rtol=0, atol=1e-4)
+    for frames, words in (
+        ("", ["none of", "camera>ball", "world>lift"]),
+        (":cube", ["cube of"]),
+        (":camera", ["camera"]),
+    ):
+        done = command("record", path, "--seen", f"/tf{frames}", "-o", tmp_path / "no.csv")
+        assert done.code == 1, frames
+        assert all(word in done.err for word in (*words, "/tf:PARENT>CHILD")), done.err
+
+
+def test_bags_of_ros_1_are_read_by_their_file(tmp_path: Path, command: Command) -> None:
+    rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="needs rosbags")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    kinds = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
+    state, point = (store.types[kind] for kind in kinds)
+    times, q = motion(40)
+    path = tmp_path / "one.bag"
+    with rosbag1.Writer(path) as writer:
+        known = [
+            writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in zip((JOINTS, PLACES), kinds, strict=True)
+        ]
+        for k, time in enumerate(times):
+            stamp = store.types["builtin_interfaces/msg/Time"](int(time), int(time % 1 * 1e9))
+            header, nothing = store.types["std_msgs/msg/Header"](k, stamp, ""), np.zeros(0)
+            at = store.types["geometry_msgs/msg/Point"](*place(q[k : k + 1])[0])
+            for own, kind, message in zip(
+                known, kinds, (state(header, NAMES, q[k], nothing, nothing), point(header, at)), strict=True
+            ):
+                writer.write(own, int(1e9 * time), store.serialize_ros1(message, kind))
+    done = command("record", path, "--seen", PLACES, "-o", tmp_path / "run.csv")
+    assert done.code == 0, done.err
+    found = [[float(row[name]) for name in NAMES] for row in rows(tmp_path / "run.csv")]
+    np.testing.assert_allclose(found, PLACES_RAD, rtol=0, atol=5e-4)
+    for wrong in (tmp_path, path.rename(tmp_path / "one.rosbag")):
+        done = command("record", wrong, "--seen", PLACES, "-o", tmp_path / "no.csv")
+        assert done.code == 1
+        assert "rosbags-convert" in done.err
 
 
 def test_images_of_stops_and_their_joints(bag: Bag, tmp_path: Path, command: Command) -> None:

@@ -43,6 +43,8 @@ def run(given: ImagesOptions) -> None:
     for one in found:
         width, height = one.size
         used = f"{len(one.used)} of {len(one.images)} images of {width} x {height} pixels"
+        if one.paired:
+            say(f"{f'{one.name}: ' * several}{one.paired}")
         corners = sum(len(image.numbers) for image in one.used)
         say(f"{f'{one.name}: ' * several}{used}, {corners} corners: {shown(output)}")
     options = " ".join(f"--reading corners={shown(path)}" for path in cameras.values())

@@ -22,6 +22,8 @@ def run(given: RecordOptions) -> None:
         table = rows_of(names, found)
         write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)], ",", "\n"))
         say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
+        if seen.values.shape[1] > len(PLACE) and TURN[0] not in table[0]:
+            say(f"without rotations: those of {given.seen} never change, as of a device that measures none")
         rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
         say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
     else:
