@@ -62,7 +62,8 @@ def output(text: str, metavar: str, default: Any = ...) -> Any:
 
 File = Literal["read", "write", "appended", "folder"]
 """What happens to a file: it must exist, is written, may come later, or is a folder that is made."""
-Length = Literal["m", "mm"]
+Length = Literal["m", "mm", "cm", "inch"]
+"""As in measurements/table_format.py, which loads torch."""
 Angle = Literal["rad", "deg"]
 Frame = Literal["base", "measuring"]
 

@@ -34,7 +34,7 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--length", "m"], "1000 times too large: check their unit (--length, mm or m)"),
+        (["--length", "m"], "1000 times too large: check their unit (--length)"),
         (["--joints", "q2,q1"], "seem to be exchanged: check the order of the joints"),
         (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
     ],
