@@ -187,7 +187,9 @@ def test_what_joint_values_and_units_mean() -> None:
     )
     said = advice(arm.nominal, dc.Measurements(q * two, points))
     assert "shoulder_joint,-{elbow_joint},forearm_roll_joint,-{wrist_bend_joint}," in said
-    assert " or " in said and "{forearm_roll_joint}+180,wrist_bend_joint," in said and "do not tell apart" in said
+    assert " or " in said
+    assert "{forearm_roll_joint}+180,wrist_bend_joint," in said
+    assert "do not tell apart" in said
     one[2] = 180 / math.pi
     assert "pi/180*{elbow_joint}," in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
     assert "100 times too small" in advice(arm.nominal, dc.Measurements(q, 0.01 * points))

@@ -33,7 +33,7 @@ NICE, KEEPS = 0.015, 3.0
 """A plainer value is right if it leaves no more than this share, or this multiple of what the best one leaves."""
 SMALLEST_LIMIT = 0.001
 """Of the share that a convention may leave: rows that the robot explains need none."""
-LEAST_PART, MOST_PART = 0.04, 1.4
+LEAST_PART, MOST_PART = 0.04, 2.2
 """Of a joint's limits, within which its values lie in the right unit."""
 RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))
 """Of gears, the usual ones first."""
