@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
-from math import inf, log
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,8 +61,6 @@ ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
 """Median residual, as a share of the spread, above which no reading is right."""
-LARGEST_UNLIKENESS = log(4.0)
-"""Of the points' spread and that of the robot's tip, in another unit of length."""
 SMALLEST_SPREAD_M = 1e-9
 """Of points that never move."""
 LARGEST_DEVIATION = 0.01
@@ -262,43 +260,35 @@ class Source:
         rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
         return rms / max(size, SMALLEST_SPREAD_M)
 
-    def conventions(self, best: float) -> Iterator[Choice]:
-        """Units and `joints` with which the robot explains positions; nothing if there are none.
+    def conventions(self, best: float, lengths: Sequence[str]) -> Iterator[Choice]:
+        """A unit of length and `joints` with which the robot explains positions; nothing if there are none.
 
         Args:
-            best: share that the best units leave with the columns as they are.
+            best: share that the best units leave with the columns as they are. lengths: units, the likeliest first.
         """
-        for table, data in self._probable_units():
-            found = likely_mistakes.conventions_of(self.robot, data, table.angle)
+        if self.rows.sockets or self.rows.readings:
+            return
+        for length in lengths:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                either = {angle: self.read(replace(self.table, length=length, angle=angle)) for angle in ("rad", "deg")}
+            turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
+            small = float(either["rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+            angle = "rad" if small else "deg"
+            data = either[angle].largest_session()
+            found = likely_mistakes.conventions_of(self.robot, data, angle)
             for one in found:
-                text = ",".join(one.texts(self.joints, table.angle, table.joints_per_metre))
+                text = ",".join(one.texts(self.joints, angle, UNITS_PER_METRE[length]))
                 why = (
                     f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns as "
                 )
                 why += f"they are {100 * best:.3g} %"
-                why += "; these rows do not tell the two apart: uncomment one" * (len(found) > 1)
+                why += "; these rows do not tell which: uncomment one" * (len(found) > 1)
                 yield Choice("joints", text, why, sure=len(found) == 1)
             if found:
-                yield Choice("length", table.length, "with these joints, by the size of the robot")
-                yield Choice("angle", table.angle, "the same")
+                yield Choice("length", length, "with these joints")
+                yield Choice("angle", angle, "the same")
                 return
-
-    def _probable_units(self) -> list[tuple[TableFormat, Measurements]]:
-        """Units in which the points are about as far apart as the robot moves, the likeliest first; and the rows."""
-        found: list[tuple[float, TableFormat, Measurements]] = []
-        if self.rows.sockets or self.rows.readings:
-            return []
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            turns = self.read(replace(self.table, angle="rad")).q[:, torch.tensor(self.robot.periodic, device=HOST)]
-            angle = "deg" if float(turns.abs().max()) > LARGEST_JOINT_ANGLE_RAD else "rad"
-            for length in UNITS_PER_METRE:
-                table = replace(self.table, length=length, angle=angle)
-                data = self.read(table).largest_session()
-                moved = spread(self.robot.tip_poses(data.q)[:, :1, :3, 3])
-                unlike = abs(log(spread(data.points) / max(moved, SMALLEST_SPREAD_M)))
-                found += [(unlike, table, data)] * (unlike < LARGEST_UNLIKENESS)
-        return [(table, data) for _, table, data in sorted(found, key=lambda entry: entry[0])]
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""

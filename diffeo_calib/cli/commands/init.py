@@ -106,7 +106,8 @@ def _units(source: Source) -> Iterator[Choice]:
     poses = [] if clear else list(proposals.camera(source))
     if best == inf and not poses:
         source.read_residual(replace(source.table, length=length, angle=angle))  # says why
-    meant = [] if poses or best < DOUBTFUL else list(source.conventions(best))
+    likely = list(dict.fromkeys(key[0] for _, key in found))[:2]
+    meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best, likely))
     if not clear and not poses and not meant:
         got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in found)
         fix = (
