@@ -182,7 +182,7 @@ def test_what_joint_values_and_units_mean() -> None:
     q, points = arm.measure(40, seed=4)
     one, two = torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
     one[2], two[[2, 4]] = -1.0, -1.0
-    assert "in degrees and mm, as 'waist_joint,shoulder_joint,-{elbow_joint}," in advice(
+    assert "in degrees and mm, with joints='waist_joint,shoulder_joint,-{elbow_joint}," in advice(
         arm.nominal, dc.Measurements(q * one, points)
     )
     said = advice(arm.nominal, dc.Measurements(q * two, points))

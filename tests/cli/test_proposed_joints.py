@@ -97,7 +97,7 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
         tmp_path / "m.safetensors",
     )
     assert done.code == 1
-    assert f"'{expected}' (--joints)" in done.error
+    assert f"the rows fit with --joints '{expected}'" in done.error
 
 
 @pytest.mark.slow

@@ -271,9 +271,9 @@ def convention_words(found: Sequence[Convention], columns: Columns | None) -> st
         names, units, what = found[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
     else:
         names, units, what = columns.joints.texts, (columns.table.angle, columns.table.joints_per_metre), ""
-    texts = [f"'{','.join(own.texts(names, *units))}'" for own in found]
+    texts = [f"joints='{','.join(own.texts(names, *units))}'" for own in found]
     doubt = ", which these rows do not tell apart" if len(texts) > 1 else ""
-    return f"the rows fit with the joints read{what} as {' or '.join(texts)}{doubt} (`joints`)"
+    return f"the rows fit{what} with {' or '.join(texts)}{doubt}"
 
 
 def _conventions(robot: Tree, data: Measurements) -> Iterator[Reading]:
