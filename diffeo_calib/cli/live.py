@@ -250,7 +250,7 @@ class Live:
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
         poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
-        return entry | {"next": [dict(zip(names, q, strict=True)) for q in poses]}
+        return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
 
     @property
     def found(self) -> Next | None:

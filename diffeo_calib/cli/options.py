@@ -62,7 +62,8 @@ def output(text: str, metavar: str, default: Any = ...) -> Any:
 
 File = Literal["read", "write", "appended", "folder"]
 """What happens to a file: it must exist, is written, may come later, or is a folder that is made."""
-Length = Literal["m", "mm"]
+Length = Literal["m", "mm", "cm", "inch"]
+"""As in measurements/table_format.py, which loads torch."""
 Angle = Literal["rad", "deg"]
 Frame = Literal["base", "measuring"]
 
@@ -76,6 +77,10 @@ PAYLOAD = "Column with the known mass that the robot carried, in any unit."
 # --- how a table is written ---------------------------------------------------------------------------------------
 
 SEP, DECIMAL = "Column separator of the table ('\\t' for a tab)", "Decimal mark of the table"
+JOINTS = (
+    "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of the "
+    "table, such as -{J2}+90 or {J3}+{J2}."
+)
 LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit of revolute joints in the table"
 
 
@@ -86,7 +91,7 @@ class StoredUnits:
     length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
     angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
-    joints: str | None = option("Joint columns in the robot's order, if not named after its joints.", "A,B,...")
+    joints: str | None = option(JOINTS, "A,B,...")
     sep: str | None = option(f"{SEP}, {AS_STORED}.")
     decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
-from diffeo_calib.calibration.identification.registration import register, register_sockets
+from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.guesses import (
@@ -38,7 +38,9 @@ from diffeo_calib.cli.guesses import (
 )
 from diffeo_calib.cli.options import CORNERS, Places, Rows
 from diffeo_calib.cli.tables import readings_columns
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
@@ -49,7 +51,7 @@ from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.poses import numbers_of
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
@@ -63,7 +65,9 @@ FEWEST_IMAGES = 8
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
-"""Median residual of a registration, m, or without positions as a share, above which no reading is right."""
+"""Median residual, as a share of the spread, above which no reading is right."""
+SMALLEST_SPREAD_M = 1e-9
+"""Of points that never move."""
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
 
@@ -74,13 +78,14 @@ class Choice(NamedTuple):
     name: str
     value: str | list[str] | bool
     why: str
+    sure: bool = True
 
     def line(self) -> str:
-        """As TOML."""
+        """As TOML; as a comment where the user is to decide."""
         values = self.value if isinstance(self.value, list) else [self.value]
         written = [json.dumps(value, ensure_ascii=False) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
-        return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
+        return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
 @dataclass(frozen=True)
@@ -272,11 +277,10 @@ class Source:
         return data.with_tips(self.tips) if self.tips else data
 
     def residual(self, table: TableFormat) -> float:
-        """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
+        """Median residual of the nominal robot in another format, as a share of the spread over all rows.
 
-        Of positions of the largest set-up in m, else of readings in m. Without any that of the ball in its socket, or
-        of a camera's image, as a share of the spread over all rows, which is small too where angles are read as too
-        small. Infinite if the table cannot be read so.
+        Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
+        wrong unit the residual alone may be small too. Infinite if the table cannot be read so.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -292,7 +296,8 @@ class Source:
         if positions is None or table.rotation is not None:
             check_poses(data)
         if positions is not None:
-            return likely_mistakes.residual_of(self.robot, positions.largest_session())
+            own = positions.largest_session()
+            return likely_mistakes.residual_of(self.robot, own) / max(spread(own.points), SMALLEST_SPREAD_M)
         own, readings = divided(data)
         if own is not None:
             return _in_sockets(self.robot, own.table)
@@ -300,19 +305,47 @@ class Source:
         lengths = [one for one in tables if one.kind != "image"]
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)
-        return identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
+        size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
+        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
+        return rms / max(size, SMALLEST_SPREAD_M)
 
-    def size(self, residual: float) -> str:
-        """A residual with its unit."""
-        return f"{100 * residual:.3g} %" if self.rows.without_length else f"{1e3 * residual:.3g} mm"
+    def conventions(self, best: float, lengths: Sequence[str]) -> Iterator[Choice]:
+        """A unit of length and `joints` with which the robot explains positions; nothing if there are none.
+
+        Args:
+            best: share that the best units leave with the columns as they are. lengths: units, the likeliest first.
+        """
+        if self.rows.sockets or self.rows.readings:
+            return
+        for length in lengths:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                either = {angle: self.read(replace(self.table, length=length, angle=angle)) for angle in ("rad", "deg")}
+            turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
+            small = float(either["rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+            angle = "rad" if small else "deg"
+            data = either[angle].largest_session()
+            found = likely_mistakes.conventions_of(self.robot, data, angle)
+            for one in found:
+                text = ",".join(one.texts(self.joints, angle, UNITS_PER_METRE[length]))
+                why = (
+                    f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns as "
+                )
+                why += f"they are {100 * best:.3g} %"
+                why += "; these rows do not tell which: uncomment one" * (len(found) > 1)
+                yield Choice("joints", text, why, sure=len(found) == 1)
+            if found:
+                yield Choice("length", length, "with these joints")
+                yield Choice("angle", angle, "the same")
+                return
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
         what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
-        what = what if self.rows.without_length else "median residual of the nominal robot"
-        than = "the table contradicts other units" if others == inf else f"in other units at least {self.size(others)}"
-        return f"{what} {self.size(best)}, {than}"
+        what = what if self.rows.without_length else "the nominal robot leaves, of what the rows vary,"
+        than = f"in other units at least {100 * others:.3g} %" if others < inf else "the table contradicts other units"
+        return f"{what} {100 * best:.2g} %, {than}"
 
 
 def _in_sockets(robot: Tree, data: Measurements) -> float:
@@ -370,8 +403,8 @@ def _clear_rotation(source: Source, formats: Mapping[Any, TableFormat], other: s
     (best, key), *others = found = residuals(source, formats)
     if not is_clear(found, gates.READINGS_TOLD_APART):
         return None
-    than = f", {other} at least {1e3 * others[0][0]:.3g} mm" if others and others[0][0] < inf else ""
-    return key, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    than = f", {other} at least {100 * others[0][0]:.3g} %" if others and others[0][0] < inf else ""
+    return key, f"the nominal robot leaves, of what the rows vary, {100 * best:.2g} %{than}"
 
 
 def _readings_of(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
@@ -409,7 +442,7 @@ def rotation(source: Source) -> Iterator[Choice]:
         yield Choice("rotation-angle", unit, "the same")
 
 
-def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
+def camera(source: Source) -> Iterator[Choice]:
     """Units and rotations that make the rows poses of a board seen by a camera on the tool.
 
     Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
@@ -417,9 +450,10 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
     names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
     if names is None or set(names) & set(source.joints):
         return
+    known = replace(source.table, rotation=names, camera_on_tool=True)
     formats = {
-        (length, angle, *turn): TableFormat(length, angle, sheet.sep, sheet.decimal, names, *turn, camera_on_tool=True)
-        for length, angle, turn in product(("m", "mm"), ("rad", "deg"), list(_readings_of(names)))
+        (length, angle, *turn): replace(known, length=length, angle=angle, convention=turn[0], rotation_angle=turn[1])
+        for length, angle, turn in product(UNITS_PER_METRE, ("rad", "deg"), list(_readings_of(names)))
     }
     found = _clear_rotation(source, formats, "read in any other way")
     if found is None:
@@ -460,7 +494,7 @@ def distance_lines(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[
     if len(names) < 2:
         yield "there is one socket alone, and no distance to know: the URDF gives the robot's size"
         return
-    length, deviation = ("0.05", "0.00003") if unit == "m" else ("50", "0.03")
+    length, deviation = (f"{metres * UNITS_PER_METRE[unit]:g}" for metres in (0.05, 3e-5))
     pair = f"{names[0]},{names[1]}={length}"
     yield f'distance = ["{pair}"]  # measure it, in {unit}, and uncomment: it gives the robot its size'
     yield f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper"

@@ -10,9 +10,10 @@ from math import degrees
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
-LENGTHS, ANGLES = {"m": 1.0, "mm": 1e3}, {"rad": 1.0, "deg": degrees(1.0)}
+LENGTHS, ANGLES = UNITS_PER_METRE, {"rad": 1.0, "deg": degrees(1.0)}
 """Units of tables, per metre and per radian."""
 
 

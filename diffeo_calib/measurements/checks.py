@@ -70,7 +70,7 @@ def unlikely_units(what: str, largest: float, unit: str, option: str, *, kinds_k
     """
     most, least = USUAL_SIZES[what]
     small = unit in ("deg", "mm")
-    if not (0 < largest <= least if small else largest > most):
+    if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]
     text = f"{what} reach {'only ' * small}{largest:g} {unit}: they look like {words}"

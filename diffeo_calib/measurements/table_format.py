@@ -14,7 +14,7 @@ from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_
 
 Names = Sequence[str] | Sequence[Sequence[str]]
 """Names of columns: a list, or one for each marker or frame."""
-UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
+UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 """A length in a file is divided by this."""
 
 

@@ -176,17 +176,24 @@ def test_honest_measurements_have_no_mistake() -> None:
     assert advice(robot, sliding_measurements(robot, 8)) == ""
 
 
-def test_what_a_reading_leaves_must_be_small() -> None:
-    """Of two joints that count the other way one mistake undone leaves a fifth; centimetres are no degrees."""
+def test_what_joint_values_and_units_mean() -> None:
+    """Signs of one joint and of two, a column in degrees, centimetres; several meanings that nothing tells apart."""
     arm = SimulatedArm(seed=3)
     q, points = arm.measure(40, seed=4)
     one, two = torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
     one[2], two[[2, 4]] = -1.0, -1.0
-    assert "elbow_joint seems to count" in advice(arm.nominal, dc.Measurements(q * one, points))
+    assert "in degrees and mm, with joints='waist_joint,shoulder_joint,-{elbow_joint}," in advice(
+        arm.nominal, dc.Measurements(q * one, points)
+    )
+    said = advice(arm.nominal, dc.Measurements(q * two, points))
+    assert "shoulder_joint,-{elbow_joint},forearm_roll_joint,-{wrist_bend_joint}," in said
+    assert " or " in said
+    assert "{forearm_roll_joint}+180,wrist_bend_joint," in said
+    assert "do not tell apart" in said
     one[2] = 180 / math.pi
-    assert "elbow_joint seem to be degrees" in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
-    for wrong_q, wrong_points in ((q * two, points), (q, 0.01 * points), (q, 10 * points)):
-        assert advice(arm.nominal, dc.Measurements(wrong_q, wrong_points)) == ""
+    assert "pi/180*{elbow_joint}," in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
+    assert "100 times too small" in advice(arm.nominal, dc.Measurements(q, 0.01 * points))
+    assert "10 times too large" in advice(arm.nominal, dc.Measurements(q, 10 * points))
 
 
 def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     out.mkdir()
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
     assert (done.code, done.err) == (0, "")
-    assert "median residual of the nominal robot" in done.out
+    assert "the nominal robot leaves, of what the rows vary" in done.out
     words = expanded(
         ["fit", str(out / "cell.toml")],
         KNOWN,

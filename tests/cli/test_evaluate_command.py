@@ -34,8 +34,8 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--length", "m"], "1000 times too large: check their unit (--length, mm or m)"),
-        (["--joints", "q2,q1"], "seem to be exchanged: check the order of the joints"),
+        (["--length", "m"], "1000 times too large: check their unit (--length)"),
+        (["--joints", "q2,q1"], "the rows fit with --joints '{q1},{q2},"),
         (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
     ],
 )

@@ -135,7 +135,7 @@ def test_wrong_file_is_one_clear_error(name: str, read: Reader) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"length": "cm"}, ("`length`", "'m' or 'mm'", "got 'cm'")),
+        ({"length": "km"}, ("`length`", "'m' or 'mm' or 'cm' or 'inch'", "got 'km'")),
         ({"angle": "degrees"}, ("`angle`", "'rad' or 'deg'", "got 'degrees'")),
         ({"decimal": "."}, ()),
         ({"decimal": ";"}, ("`decimal`", "';'")),
@@ -244,7 +244,7 @@ def test_joints_alone_may_repeat_and_are_those_of_the_measurements(tmp_path: Pat
         ("q1,q3\n1,2\n", {}, ("no column ['q2']", "['q1', 'q3']")),
         ("q1,q2\n", {}, ("header but no rows",)),
         ("q1,q2\n1,2\n", {"angle": "turns"}, ("`angle`", "'turns'")),
-        ("q1,q2\n1,2\n", {"length": "cm"}, ("`length`", "'cm'")),
+        ("q1,q2\n1,2\n", {"length": "km"}, ("`length`", "'km'")),
     ],
 )
 def test_wrong_joints_are_one_clear_error(

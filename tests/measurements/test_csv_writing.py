@@ -73,7 +73,7 @@ def test_written_columns(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"length": "inch"}, ("`length`", "'m' or 'mm'")),
+        ({"length": "foot"}, ("`length`", "'m' or 'mm'")),
         ({"joints": ["a"]}, ("joint columns", "expected 2", "got 1")),
         ({"position": [POSITION, ["u", "v", "w"]]}, ("position triples", "expected 1", "got 2")),
         ({"joints": ["x", "b"]}, ("distinct columns", "x")),

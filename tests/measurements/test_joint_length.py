@@ -76,7 +76,7 @@ def test_units_that_look_wrong_are_doubted(read: Reader) -> None:
 
 def test_wrong_use_is_explained(read: Reader) -> None:
     for options, message in (
-        ({"joints": ROBOT, "joint_length": "cm"}, "`joint_length`: expected 'm' or 'mm', got 'cm'"),
+        ({"joints": ROBOT, "joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
         ({"joint_length": "m"}, "`joint_length` without the kinds of the joints: .*; pass the robot, or `kinds`"),
     ):
         with pytest.raises(MeasurementError, match=message):

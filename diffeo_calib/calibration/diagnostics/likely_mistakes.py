@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
-from itertools import combinations, product
-from math import pi
+from itertools import combinations, permutations
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.conventions import Convention, Seen, conventions, frame_projector
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -35,6 +35,7 @@ from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
@@ -83,7 +84,7 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     if columns is None:
         return
     spare, as_read = _spare(columns, table), Reading.of(robot, data)
-    for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints, strict=True)):
+    for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints.texts, strict=True)):
         for name in _similar([joint, own], spare):
             q = data.q.clone()
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
@@ -143,8 +144,6 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
     return values.deg2rad() if columns.table.angle == "deg" else values
 
 
-RIGHT_ANGLES = ((pi / 2, "90"), (-pi / 2, "-90"), (pi, "180"))
-"""Usual joint offsets of another convention [rad, deg]."""
 NO_MISTAKE_FOUND = (
     "check the angle unit, the order of the joints, the tip link or DH convention, "
     "and that rows pair joints with their own points"
@@ -161,7 +160,7 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
         a phrase: the mistake that explains them; empty if there is none.
     """
     good: list[tuple[float, Reading]] = []
-    for group in (_other_points, other_rotations, _other_joints, longer_chains, other_columns):
+    for group in (_other_points, other_rotations, _other_units, longer_chains, other_columns, _conventions):
         for reading in group(robot, data):
             residual = _residual(reading)
             if residual < min(gates.OTHER_READING_LEFT * typical, gates.RIGHT_READING * spread(reading.points)):
@@ -254,9 +253,10 @@ def _residual(reading: Reading) -> float:
 def _other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in another unit, of the row before or after, in a frame of the other hand, or of exchanged tips."""
     own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
-    for factor, size in ((1e3, "small"), (1e-3, "large")):
+    for factor in sorted({one / other for one, other in permutations(UNITS_PER_METRE.values(), 2)}):
+        times, size = (factor, "small") if factor > 1.0 else (1 / factor, "large")
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
-        words = f"the positions seem to be 1000 times too {size}: check their unit (`length`, mm or m)"
+        words = f"the positions seem to be {times:.4g} times too {size}: check their unit (`length`)"
         yield replace(own, points=points, words=words)
     words = "the points seem to be one row too {}: pair every configuration with its own"
     yield replace(own, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
@@ -270,10 +270,10 @@ def _other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
         yield replace(own, words=words, on=tuple(exchanged.get(tip, tip) for tip in own.on))
 
 
-def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Joint values with one mistake undone."""
+def _other_units(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Joint values in other units."""
     own = Reading.of(robot, data)
-    return (replace(own, q=q, words=words) for q, words in corrections_of_joints(robot, data))
+    return (replace(own, q=q, words=words) for q, words in corrections_of_units(robot, data.q))
 
 
 def corrections_of_angles(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]]:
@@ -283,29 +283,46 @@ def corrections_of_angles(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]
         yield torch.where(turning, factor * q, q), angle_mistake(words)
 
 
-def corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
-    """Joint values (N, n) with one mistake undone, and the mistake."""
-    names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
-    yield from corrections_of_angles(robot, data.q)
+def corrections_of_units(robot: Tree, q: Tensor) -> Iterator[tuple[Tensor, str]]:
+    """Joint values (N, n) in other units of angles and lengths, with the mistake that each undoes."""
+    turning = torch.tensor(robot.periodic, dtype=torch.bool, device=q.device)
+    yield from corrections_of_angles(robot, q)
     for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
-        q = torch.where(turning, data.q, factor * data.q)
-        yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
+        text = f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
+        yield torch.where(turning, q, factor * q), text
 
-    def changed(k: int, factor: float = 1.0, offset: float = 0.0) -> Tensor:
-        q = data.q.clone()
-        q[:, k] = factor * q[:, k] + offset
-        return q
 
-    for k, name in enumerate(names):
-        yield changed(k, -1.0), f"{name} seems to count the other way: change the sign of its column, or of its axis"
-        for factor, words in ANGLE_MISTAKES if robot.periodic[k] else ():
-            yield changed(k, factor), f"the values of {name} seem to be {words}; check its unit"
-    for a, b in combinations(range(len(names)), 2):
-        q = data.q.clone()
-        q[:, [a, b]] = data.q[:, [b, a]]
-        yield q, f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints"
-    # Last: half a turn of one joint may look like another one that counts the other way.
-    for k, (offset, degrees) in product(range(len(names)), RIGHT_ANGLES):
-        if robot.periodic[k]:
-            words = f"{names[k]} seems to have another offset: its values fit with {degrees} degrees added"
-            yield changed(k, offset=offset), words
+def convention_words(found: Sequence[Convention], columns: Columns | None) -> str:
+    """Advice on conventions of a table, or of joint values in SI, which rows do not tell apart."""
+    if columns is None:
+        names, units, what = found[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
+    else:
+        names, units, what = columns.joints.texts, (columns.table.angle, columns.table.joints_per_metre), ""
+    texts = [f"joints='{','.join(own.texts(names, *units))}'" for own in found]
+    doubt = ", which these rows do not tell apart" if len(texts) > 1 else ""
+    return f"the rows fit{what} with {' or '.join(texts)}{doubt}"
+
+
+def _conventions(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Joint values in another convention."""
+    columns, own = rotations.numeric_table(data)[0], Reading.of(robot, data)
+    found = conventions_of(robot, data, "rad" if columns is None else columns.table.angle)
+    for one in found[:1]:
+        q = data.q @ one.matrix.mT + one.offset
+        yield replace(own, q=q, words=convention_words(found, columns))
+
+
+def conventions_of(robot: Tree, data: Measurements, angle: str) -> list[Convention]:
+    """What joint values mean whose rows the robot does not explain, see :func:`conventions`."""
+    marker = int(data.visible.sum(0).argmax())
+    rows = data.visible[:, marker].nonzero()[:, 0]
+    own, places = Reading.of(robot, data), data.points[rows, marker]
+    tip = robot.tips.index(data.on[marker]) if data.on else 0
+
+    def judge(q: Tensor) -> float:
+        return _residual(replace(own, q=q)) / spread(data.points)
+
+    def projector(chosen: Tensor) -> Tensor:
+        return frame_projector(places[chosen])
+
+    return conventions(robot, data.q, Seen(tip, rows, projector, angle, judge))

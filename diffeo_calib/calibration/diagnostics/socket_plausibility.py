@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.conventions import Seen, conventions, socket_projector
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    convention_words,
     corrections_of_angles,
-    corrections_of_joints,
+    corrections_of_units,
     refuse_or_warn,
 )
 from diffeo_calib.calibration.identification.identification import Identification
@@ -142,12 +144,22 @@ def check_registration(
     """
     median, motion = float(found.distances.median()), _motion(robot, data.q)
     far = median > gates.SOCKET_FAR * robot.reach
-    tried = corrections_of_joints(robot, data) if far else corrections_of_angles(robot, data.q)
+    tried = corrections_of_units(robot, data.q) if far else corrections_of_angles(robot, data.q)
     best, mistake = min(gates.OTHER_READING_LEFT * median / motion, gates.RIGHT_READING), ""
+    socket = data.socket_numbers
+
+    def left(q: Tensor) -> float:
+        again = register_sockets(robot if around is None else around, q, socket)
+        return float(again.distances.median()) / _motion(robot, q)
+
     for q, words in tried:
-        again = register_sockets(robot if around is None else around, q, data.socket_numbers)
-        left = float(again.distances.median()) / _motion(robot, q)
-        best, mistake = (left, words) if left < best else (best, mistake)
+        share = left(q)
+        best, mistake = (share, words) if share < best else (best, mistake)
+    if far and not mistake and around is None:
+        rows = (socket >= 0).nonzero()[:, 0]
+        seen = Seen(0, rows, lambda chosen: socket_projector(socket[rows[chosen]]), "rad", left)
+        kinds = conventions(robot, data.q, seen)
+        mistake = convention_words(kinds, None) if kinds else ""
     fix = (
         "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the place "
     )

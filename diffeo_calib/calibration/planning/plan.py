@@ -197,7 +197,7 @@ class Plan:
         devices = [[name] for name in self.devices] or [[]] * len(self)
         values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()
         rows = zip(values, self.rank.tolist(), devices, strict=True)
-        header = [*columns.joints, "rank", *["device"] * bool(self.devices)]
+        header = [*columns.joints.columns, "rank", *["device"] * bool(self.devices)]
         write_rows(path, header, [[[*joints, rank, *device] for joints, rank, device in rows]], table)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,13 +26,15 @@ from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
 
 CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
+DOUBTFUL = 0.01
+"""Share of what the rows vary, left by the best units, above which other meanings of the joints are sought."""
 NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
@@ -101,16 +104,17 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
         yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
     elif arm.links.tip is not None:
         yield Choice("tip", arm.links.tip[0], why)
-    yield Choice("joints", ",".join(seen.joints), arm.how)
+    meant = [choice for choice in units if choice.name == "joints"]
+    yield from meant or [Choice("joints", ",".join(seen.joints), arm.how)]
     for choice in seen.rows.entries():
         yield choice._replace(value=_from_folder(choice.value, folder))
     if seen.marker is not None:
         yield seen.marker
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    yield from units
+    yield from (choice for choice in units if choice not in meant)
     if not any(choice.name == "rotation" for choice in units):
-        yield from proposals.beside(replace(seen, table=_format(units, sheet)), sheet)
+        yield from proposals.beside(replace(seen, table=_format(units, seen)), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
@@ -123,11 +127,11 @@ def _from_folder(value: Any, folder: Path) -> Any:
     return CORNERS + relpath(value.removeprefix(CORNERS), folder) if named else value
 
 
-def _format(units: list[Choice], sheet: Sheet) -> TableFormat:
+def _format(units: list[Choice], seen: Source) -> TableFormat:
     """The format of positions and joints in these units."""
     found = {choice.name: choice.value for choice in units}
-    on_tool = "camera-on-tool" in found and "rotation" not in found
-    return TableFormat(str(found["length"]), str(found["angle"]), sheet.sep, sheet.decimal, camera_on_tool=on_tool)
+    known = {name: found.get(name.replace("_", "-")) for name in ("length", "angle", "joint_length")}
+    return replace(seen.table, **known, camera_on_tool="camera-on-tool" in found and "rotation" not in found)
 
 
 class Explained(NamedTuple):
@@ -152,9 +156,13 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
                 joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
                 columns = arm.columns if joints is None else joints[0]
-                seen = Source(csv, chain, columns, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+                table = TableFormat("mm", "deg", sheet.sep, sheet.decimal)
+                seen = Source(csv, chain, columns, rows, table, sheet.numbers, tips)
                 seen = replace(seen, marker=proposals.marker(seen, sheet))
-                one = _with_tip(robot, Explained(arm, "", seen, list(_units(seen, sheet))), sheet)
+                units = list(_units(seen))
+                meant = [str(choice.value) for choice in units if choice.name == "joints"]
+                seen = replace(seen, joints=meant[0].split(",") if len(meant) == 1 else columns)
+                one = _with_tip(robot, Explained(arm, "", seen, units))
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
             refused.append(error)
@@ -162,8 +170,8 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
         raise refused[0]
     if len(found) == 1:
         return next(iter(found.values()))
-    best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, sheet)))
-    alike = {key: one.seen.residual(_format(best.units, sheet)) for key, one in found.items()}
+    best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, one.seen)))
+    alike = {key: one.seen.residual(_format(best.units, best.seen)) for key, one in found.items()}
     if not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
         got = "; ".join(f"{key[0] or few(key[1:], 9)}: {best.seen.size(size)}" for key, size in alike.items())
         fix = "say the convention in the file, by a line such as `# craig`" if best.arm.links.dh_convention else ""
@@ -203,16 +211,16 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
 
-def _with_tip(robot: Path, found: Explained, sheet: Sheet) -> Explained:
+def _with_tip(robot: Path, found: Explained) -> Explained:
     """The same without joints at the end that no marker follows, and why."""
     arm, _, seen, units = found
-    table, left_out = _format(units, sheet), list[str]()
+    table, left_out = _format(units, seen), list[str]()
     q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
     moved = (q.amax(0) - q.amin(0)).tolist()
     while len(arm.joints) > 1 and not seen.tips:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
-        without = replace(seen, robot=load_robot(robot, shorter.links), joints=shorter.columns)
+        without = replace(seen, robot=load_robot(robot, shorter.links), joints=seen.joints[:count])
         if moved[count] < UNMOVED_JOINT_RANGE:
             left_out.append(f"{last} hardly moves in the table")
         else:
@@ -224,7 +232,7 @@ def _with_tip(robot: Path, found: Explained, sheet: Sheet) -> Explained:
             left_out.append(f"{words} {seen.size(residual)}")
         arm, seen = shorter, without
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
-    return Explained(arm, why, seen, list(_units(seen, sheet)) if left_out else units)
+    return Explained(arm, why, seen, list(_units(seen)) if left_out else units)
 
 
 def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
@@ -239,40 +247,57 @@ def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[
     return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])
 
 
-def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
-    """Units with which the nominal robot can explain the positions, or the sockets."""
-    no_length = source.rows.without_length and all(source.robot.periodic)
-    marks = sheet.sep, sheet.decimal
-    formats = {
-        key: TableFormat(*key[:2], *marks, camera_on_tool=bool(key[2]))
-        for key in product(
-            ("mm",) if no_length else ("m", "mm"),
-            ("rad", "deg"),
-            ("", "camera on the tool") if source.rows.of_boards else ("",),
+def _units(source: Source) -> Iterator[Choice]:
+    """Units, and a meaning of the joints' columns, with which the nominal robot can explain the rows."""
+    no_length, boards = source.rows.without_length and all(source.robot.periodic), source.rows.of_boards
+    lengths = ["mm"] if no_length else list(UNITS_PER_METRE)
+    found = _left(source, lengths, [None], boards=boards)
+    if not all(source.robot.periodic) and not proposals.is_clear(found, CLEAR_RATIO):
+        others = _left(source, lengths, lengths, boards=boards)
+        found = others if proposals.is_clear(others, CLEAR_RATIO) else found
+    (best, (length, angle, slides, camera)), *others = found
+    clear = proposals.is_clear(found, CLEAR_RATIO)
+    poses = [] if clear else list(proposals.camera(source))
+    if best == inf and not poses:
+        source.read_residual(replace(source.table, length=length, angle=angle))  # says why
+    likely = list(dict.fromkeys(key[0] for _, key in found))[:2]
+    meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best, likely))
+    if not clear and not poses and not meant:
+        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in found)
+        fix = (
+            "no signs, zeros, coupling or units of the joints do either: check the table's joints against the URDF, or "
         )
-    }
-    (best, (length, angle, camera)), *others = found = proposals.residuals(source, formats)
-    if not proposals.is_clear(found, CLEAR_RATIO):
-        poses = list(proposals.camera(source, sheet))
-        if best == inf and not poses:
-            source.read_residual(TableFormat(length, angle, *marks))  # says why
-        if not poses:
-            got = "; ".join(f"{' and '.join(filter(None, units))}: {source.size(value)}" for value, units in found)
-            fix = "check the table's joints against the URDF, or write the file yourself; of a robot with several tips "
-            fix += "the columns of each are to be named after it, such as left_x"
-            what = "units with which the robot explains the rows"
-            raise InputError.of(what, expected="one clear reading", got=got, fix=fix)
-        yield from poses
+        fix += (
+            "write the file yourself; of a robot with several tips the columns of each are to be named after it, such "
+        )
+        fix += "as left_x"
+        what = "units with which the robot explains what the rows vary"
+        raise InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
+    if poses or meant:
+        yield from poses or meant
         return
     why = source.words(best, others[0][0])
     yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
     yield Choice("angle", angle, why if no_length else "the same")
+    if slides:
+        yield Choice("joint-length", slides, "the same: the slides are in another unit")
     if camera:
         yield Choice("camera-on-tool", True, "the same; else the board is on the tool")
+
+
+def _left(source: Source, lengths: list[str], slides: list[Any], *, boards: bool) -> list[tuple[float, Any]]:
+    """Share of the rows that is left with units of length and angle, of slides, and with the camera on the tool."""
+    formats = {
+        key: replace(source.table, length=key[0], angle=key[1], joint_length=key[2], camera_on_tool=bool(key[3]))
+        for key in product(lengths, ("rad", "deg"), slides, ("", "camera on the tool") if boards else ("",))
+        if key[2] != key[0]
+    }
+    return proposals.residuals(source, formats)
 
 
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
     texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
     corners = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
-    return corners | {name for text in texts for name in text.rpartition("=")[2].split(",")}
+    names = (name for text in texts for name in text.rpartition("=")[2].split(","))
+    return corners | {name for each in names for name in re.findall(r"\{([^{}]+)\}", each) or [each]}

@@ -13,6 +13,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import Hideable, repeated
+from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,
@@ -96,7 +97,7 @@ class Columns:
 
     Args:
         table: units, and the convention of the rotation.
-        joints: names of n joints.
+        joints: names or expressions of n joints.
         prismatic: (n,) which of them are prismatic.
         triples: names of x, y and z of every marker.
         rotation: names of the columns of the rotations, as many for each of the triples.
@@ -108,7 +109,7 @@ class Columns:
     """
 
     table: TableFormat
-    joints: tuple[str, ...]
+    joints: JointExpressions
     prismatic: Tensor
     triples: list[tuple[str, ...]]
     rotation: tuple[str, ...] = ()
@@ -144,9 +145,9 @@ class Columns:
         std = _std_names(table.std, len(triples))
         if table.payload is not None:
             column_names("payload", [table.payload], "the name of a column", (1,))
-        own = table, names, prismatic, triples, rotation, std, rotation_std
+        own = table, JointExpressions.of(names), prismatic, triples, rotation, std, rotation_std
         columns = cls(*own, kinds_known, tuple(readings), all_hidden)
-        twice = repeated(columns.names)
+        twice = repeated(columns.names) or repeated(names)
         if twice:
             plain = len(columns.names) == len(names) + 3 * len(triples)
             what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
@@ -159,7 +160,11 @@ class Columns:
     def groups(self) -> dict[Any, Group]:
         """All columns by what they hold, joints first; those of readings by themselves."""
         table, positions = self.table, tuple(name for triple in self.triples for name in triple)
-        found = {"q": Group(self.joints), "points": Group(positions, table.length), "rotations": Group(self.rotation)}
+        found = {
+            "q": Group(self.joints.columns),
+            "points": Group(positions, table.length),
+            "rotations": Group(self.rotation),
+        }
         found |= {name: Group((column,)) for name, column in table.covariates.items()}
         found |= {} if table.payload is None else {"payload": Group((table.payload.strip(),), None, MASS)}
         found["std"] = Group(self.std, table.length, DEVIATION)
@@ -209,7 +214,7 @@ class Columns:
         """
         found, count = self._parts(raw), len(self.triples)
         values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
-        q, table = found["q"], self.table
+        q, table = self.joints.values(found["q"]), self.table
         turns = q.deg2rad() if table.angle == "deg" else q
         values["q"] = torch.where(self.prismatic, q / table.joints_per_metre, turns)
         for name in {"points", "std", "rotation_std"} & {*values}:
@@ -226,17 +231,19 @@ class Columns:
         return {column: cells for pair in pairs for column, cells in pair}
 
     def joints_from_si(self, q: Tensor) -> Tensor:
-        """Joint values (N, n) in rad and m as rows in the file's units."""
+        """Joint values (N, n) in rad and m as the cells (N, c) of their columns, in the file's units."""
         q, table = q.cpu(), self.table
-        return torch.where(self.prismatic, q * table.joints_per_metre, q.rad2deg() if table.angle == "deg" else q)
+        turns = q.rad2deg() if table.angle == "deg" else q
+        return self.joints.cells(torch.where(self.prismatic, q * table.joints_per_metre, turns))
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         found, table = self._parts(raw), self.table
-        angle, known = _largest(found["q"][:, ~self.prismatic]), self.kinds_known
+        q = self.joints.values(found["q"])[:, self.joints.plain]
+        slide = self.prismatic[self.joints.plain]
+        angle, known = _largest(q[:, ~slide]), self.kinds_known
         sentences = unlikely_units("angles", angle, table.angle, "angle", kinds_known=known)
-        slides = _largest(found["q"][:, self.prismatic])
-        sentences += unlikely_units("prismatic joints", slides, table.joint_unit, "joint_length")
+        sentences += unlikely_units("prismatic joints", _largest(q[:, slide]), table.joint_unit, "joint_length")
         if self.triples:
             sentences += unlikely_units("positions", _largest(found["points"]), table.length, "length")
         if self.rotation and len(self.rotation) == 3 * len(self.triples):

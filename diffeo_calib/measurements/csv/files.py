@@ -156,11 +156,12 @@ def read_measurements(
     Args:
         path: the file.
         robot: whose joints name the columns (``joint_names``, ``kinds``); or these names without a robot, in its order.
-        joints: names of the columns in the robot's order, where they are not those of its joints.
+        joints: names of the columns in the robot's order, where they are not those of its joints, or expressions of
+            columns in the units of the file, such as ``"-{J2}+90"``, ``"{J3}+{J2}"`` or ``"360/4096*{ticks5}-180"``.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
             sockets. With ``socket`` every line has a position or a socket, and empty cells for the other; a line with
             both is two rows.
-        length: unit of the positions in the file, ``"m"`` or ``"mm"``.
+        length: unit of the positions in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
@@ -178,7 +179,7 @@ def read_measurements(
             per marker or three per marker.
         rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
             which are not the axes of Euler angles: one for all, or one or three for each frame.
-        joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
+        joint_length: unit of the prismatic joints in the file, as ``length``; that of the positions by default.
         payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
             For another link see :meth:`Measurements.with_payload`.
         time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
@@ -261,7 +262,7 @@ def read_readings(
         path, robot, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.
         values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
         kind: "distance", "height" or "image".
-        length: unit of the readings in the file, ``"m"`` or ``"mm"``; images are in pixels.
+        length: unit of the readings in the file, as in :func:`read_measurements`; images are in pixels.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         std: name of a column with standard deviations of the readings in their unit, or of two for images.
         session: name of the column that names the device of each row: fixed point, plane or camera. One by default.

@@ -73,7 +73,7 @@ class ImageColumns(SensorColumns):
         known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
         if CAMERA in rows.texts:
             known["seen_by"] = first.named(CAMERA, "the name of the camera")
-        data = Measurements.from_images(first.values["q"], corners, self.camera, rows.columns.joints, **known)
+        data = Measurements.from_images(first.values["q"], corners, self.camera, rows.columns.joints.texts, **known)
         set_ups = first.devices(self.device, "a name")
         return data if set_ups is None else data.with_sessions(set_ups)
 

@@ -169,7 +169,7 @@ class CsvLines:
         try:
             yield
         except IsADirectoryError as error:
-            fix = f"of images of a board run `diffeo-calib images '{self.path}' JOINTS.csv ...` first, and pass its table"
+            fix = f"of images of a board run `diffeo-calib images '{self.path}' JOINTS.csv ...`, and pass its table"
             raise MeasurementError.of(f"'{self.path}' is a folder", expected="a table", fix=fix) from error
         except OSError as error:
             what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"

@@ -149,13 +149,13 @@ class PositionColumns(SensorColumns):
         values, columns, table = rows.values, rows.columns, rows.columns.table
         std, turns = values.get("std"), values.get("rotation_std")
         if table.convention is None:
-            data = Measurements(values["q"], values["points"], columns.joints, names, std=std, doubt=False)
+            data = Measurements(values["q"], values["points"], columns.joints.texts, names, std=std, doubt=False)
         else:
             single = len(columns.triples) == 1
             data = Measurements.from_poses(
                 values["q"],
                 of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"])),
-                columns.joints,
+                columns.joints.texts,
                 lever=table.lever,
                 position_std=std[:, 0] if single and std is not None else std,
                 rotation_std=turns[:, 0] if single and turns is not None else turns,
@@ -256,7 +256,7 @@ class SocketColumns(SensorColumns):
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
         known = {"distances": self.distances, "distance_std": self.distance_std}
-        data = Measurements.from_sockets(rows.values["q"], names, rows.columns.joints, **known, doubt=False)
+        data = Measurements.from_sockets(rows.values["q"], names, rows.columns.joints.texts, **known, doubt=False)
         return data.with_tips(None if self.on is None else [self.on])
 
     def written(self, part: Any, table: TableFormat) -> Written:
@@ -315,7 +315,7 @@ class ReadingColumns(SensorColumns):
 
     def table(self, rows: FileRows) -> Readings:
         """See :class:`SensorColumns`."""
-        q, joints, table = rows.values["q"], rows.columns.joints, rows.columns.table
+        q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
         (own,) = self.reported(table)
         if isinstance(self.values, tuple):
             seen = rows.values[own.values]

@@ -60,7 +60,7 @@ class TableOrigin:
         lever = f"{table.lever * table.per_metre:.17g}" if columns.rotation and table.lever != LEVER else None
         one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
         one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
-        one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints)}
+        one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints.texts)}
         one |= {**table.covariates, "session": self.session, "marker": self.marker}
         one |= {"sep": table.sep, "decimal": table.decimal}
         words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]

@@ -65,7 +65,7 @@ def write_predictions(
         InputError: a file that cannot be written.
     """
     columns, count = Columns.of(table.joints_only(), joints, kinds, []), len(prefixes)
-    names, turned = list(columns.joints), [()] * count
+    names, turned = list(columns.joints.columns), [()] * count
     if poses:
         table = table.for_writing(rotation_std=True, prefixes=prefixes)
         turns, deviations = (flat_names(own) for own in (table.rotation, table.rotation_std))
@@ -159,7 +159,7 @@ class Program:
             InputError: a file that cannot be written.
         """
         values = joints.joints_from_si(q).tolist()
-        places = [self.header.index(name) for name in joints.joints]
+        places = [self.header.index(name) for name in joints.joints.columns]
         lines = [[*self.header, *added]]
         for row, cells in enumerate(self.rows):
             line = list(cells)
@@ -225,7 +225,7 @@ def write_measurements(
     columns, table = _sheet(whole, table, position, session)
     columns = replace(columns, joints=names, kinds=kinds)
     numeric = columns.numeric(table)
-    check_count("joint columns", numeric.joints, whole.n, "joint")
+    check_count("joint columns", numeric.joints.texts, whole.n, "joint")
     sockets = () if columns.sockets is None else columns.sockets.names
     images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in columns.readings)
     sessions = {columns.session, *(one.device for one in columns.readings)} - {None}

@@ -1,0 +1,345 @@
+"""What the joint values of a table mean where the robot does not explain its rows: signs, zeros, couplings and units.
+
+Sought are M and b with which the joint values ``q = M q_read + b`` explain the rows. Signs, couplings and units are
+tried from discrete starts; the zeros b, and factors that are not known, are found by damped least squares. The places
+p(q, c) = R(q) c + t(q) of a marker c are compared with what was seen by a projector P that removes all that a frame can
+explain, affine functions of the measured places, or one place for each socket: |P p| is made small. No frame has to be
+found, so that many starts are cheap. What is left is judged by a rigid registration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from math import degrees, pi
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.robots.tree import Tree
+
+ROWS, ZEROS, KEPT, EXAMINED = 24, 64, 64, 8
+"""Rows of the search, starts of zeros without a change of sign, starts that go on, and equivalents made plain."""
+FIRST_STEPS, STEPS, LAST_STEPS = 5, 20, 6
+LARGEST_STEP, MARKER_M = 0.7, 0.5
+"""Of joints [rad or m], and of the marker on the tip [m]."""
+PROMISING = 0.02
+"""Share of the spread that is left in an affine frame by what is examined further."""
+NICE, KEEPS = 0.015, 3.0
+"""A plainer value is right if it leaves no more than this share, or this multiple of what the best one leaves."""
+SMALLEST_LIMIT = 0.001
+"""Of the share that a convention may leave: rows that the robot explains need none."""
+LEAST_PART, MOST_PART = 0.04, 2.2
+"""Of a joint's limits, within which its values lie in the right unit."""
+RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))
+"""Of gears, the usual ones first."""
+RIGHT_ANGLES = {1.0: "+pi/2", -1.0: "-pi/2", 2.0: "+pi"}
+
+
+@dataclass(frozen=True, eq=False)
+class Convention:
+    """Joint values ``q @ matrix.T + offset`` in the place of those that were read, q (N, n) [rad or m].
+
+    Args:
+        robot: n joints. matrix: (n, n). offset: (n,) rad or m. left: what they leave, as a share of the spread.
+    """
+
+    robot: Tree
+    matrix: Tensor
+    offset: Tensor
+    left: float
+
+    @property
+    def cost(self) -> int:
+        """How many values are not those that were read; a factor of all joints counts once."""
+        own, mixed = self.matrix.diagonal(), (self.matrix != 0.0).sum(1) > 1
+        factors = {round(value, 9) for value in own.abs().tolist()} - {0.0, 1.0}
+        changes = (own < 0.0).sum() + (self.offset != 0.0).sum() + mixed.sum() + (own == 0.0).sum() // 2
+        return int(changes) + len(factors)
+
+    def texts(self, names: tuple[str, ...] | list[str], angle: str, per_metre: float) -> list[str]:
+        """Expressions for `joints`: names of the columns, and the units of the table."""
+        found = []
+        for k, turns in enumerate(self.robot.periodic):
+            terms = [_term(value, name, angle) for value, name in zip(self.matrix[k].tolist(), names, strict=True)]
+            zero = float(self.offset[k])
+            constant = (degrees(zero) if angle == "deg" else zero) if turns else zero * per_metre
+            quarters = RIGHT_ANGLES.get(round(zero / (pi / 2), 6)) if turns and angle == "rad" else None
+            text = "".join(terms).removeprefix("+") + (quarters or f"{constant:+.6g}" * (constant != 0.0))
+            found.append(names[k] if text == f"{{{names[k]}}}" else text)
+        return found
+
+
+def _term(value: float, name: str, angle: str) -> str:
+    """A factor and its column: -360/4096*{name}."""
+    turn, words = (360.0, "360") if angle == "deg" else (2 * pi, "2*pi")
+    known = {1.0: "", 180 / pi: "180/pi*", pi / 180: "pi/180*"} | {1 / ratio: f"1/{ratio}*" for ratio in RATIOS}
+    known |= {turn / 2**k: f"{words}/{2**k}*" for k in range(8, 25)}
+    text = next((text for one, text in known.items() if abs(one - abs(value)) < 1e-9 * one), f"{abs(value):.6g}*")
+    return f"{'-' if value < 0.0 else '+'}{text}{{{name}}}" if value else ""
+
+
+class Seen(NamedTuple):
+    """What rows show of a robot.
+
+    Args:
+        tip: number of the tip. rows: (R,) those to use. projector: of some of ``rows`` (M,) -> (M, M).
+        angle: unit of the table. judge: what a rigid registration of joint values (N, n) leaves, as a share.
+    """
+
+    tip: int
+    rows: Tensor
+    projector: Callable[[Tensor], Tensor]
+    angle: str
+    judge: Callable[[Tensor], float]
+
+
+def conventions(robot: Tree, q: Tensor, seen: Seen) -> list[Convention]:
+    """The plainest conventions that explain rows which the robot does not explain as they were read.
+
+    Args:
+        robot: n joints. q: (N, n) joint values as read [rad or m]. seen: what the rows show.
+
+    Returns:
+        none if nothing explains the rows far better; several if the rows do not tell them apart.
+    """
+    limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * seen.judge(q))
+    chosen = torch.randperm(len(seen.rows), generator=seeded(0), device=HOST)[:ROWS]
+    if len(chosen) < 2 * (2 + robot.n) or limit < SMALLEST_LIMIT:
+        return []
+    own, projector = q[seen.rows[chosen]], seen.projector(chosen)
+    search = _Search(robot, seen.tip, own, projector, 180 / pi if seen.angle == "deg" else 1.0)
+
+    def judged(matrix: Tensor, offset: Tensor) -> Convention:
+        return Convention(robot, matrix, offset, seen.judge(q @ matrix.mT + offset))
+
+    def rigid(starts: _Starts) -> Iterator[_Starts]:
+        """Those (1,) that are good in a rigid frame too, one for each pattern of signs."""
+        kept = list[Tensor]()
+        for row, pattern in enumerate(starts.matrix.sign()):
+            known = len(kept) == EXAMINED or any(torch.equal(pattern, one) for one in kept)
+            if not known and judged(starts.matrix[row], starts.offset[row]).left < limit:
+                kept.append(pattern)
+                yield _Starts(*(part[row : row + 1] for part in starts))
+
+    first = next((one for starts in search.tried() for one in rigid(search.best(starts))), None)
+    plain = [] if first is None else [search.plainer(one) for one in rigid(search.equivalents(first))]
+    good = sorted((judged(*one) for one in plain), key=lambda one: one.left)
+    near = [one for one in good if one.left < min(limit, KEEPS * good[0].left)]
+    least = min((one.cost for one in near), default=0)
+    return [one for one in near if one.cost == least and least]
+
+
+def frame_projector(points: Tensor) -> Tensor:
+    """(M, M) that removes affine functions of points (M, 3)."""
+    return _without(torch.cat([torch.ones_like(points[:, :1]), points - points.mean(0)], 1))
+
+
+def socket_projector(socket: Tensor) -> Tensor:
+    """(M, M) that removes the mean of each socket (M,)."""
+    return _without((socket[:, None] == socket.unique()).double())
+
+
+def _without(basis: Tensor) -> Tensor:
+    own = torch.linalg.qr(basis / basis.norm(dim=0).clamp(min=1e-12)).Q
+    return torch.eye(len(own), dtype=own.dtype, device=own.device) - own @ own.mT
+
+
+class _Starts(NamedTuple):
+    """B conventions: matrices (B, n, n), zeros (B, n), which of them and which factors are sought, what they leave."""
+
+    matrix: Tensor
+    offset: Tensor
+    free: Tensor
+    scaled: Tensor
+    share: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search over rows q (N, n), as read, of the tip with this number; see :class:`Seen` for the projector.
+
+    Args:
+        per_rad: how many of the table's angles are one rad.
+    """
+
+    robot: Tree
+    tip: int
+    q: Tensor
+    projector: Tensor
+    per_rad: float
+
+    @property
+    def turning(self) -> Tensor:
+        """(n,) boolean."""
+        return torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
+
+    @property
+    def room(self) -> Tensor:
+        """(n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]."""
+        ends = torch.where(self.turning, pi, 1.0)[:, None] * self.robot.limits.sign()
+        return torch.where(self.robot.limits.isfinite(), self.robot.limits, ends)
+
+    def tried(self) -> Iterator[_Starts]:
+        """Starts: signs and zeros; exchanged or coupled columns; other units of all joints, and of some."""
+        n, turning = self.robot.n, self.turning
+        one, width, span = torch.eye(n, dtype=torch.float64, device=HOST), *self._sizes()
+        large = turning & (span > MOST_PART * width)
+        small = turning & (span < LEAST_PART * width)
+        if not bool(large.any()):
+            yield self.starts(one, self.zeros(ZEROS))
+        mixed = [self.starts(one[self._exchanged(a, b)], self.zeros(2), 0) for a, b in combinations(range(n), 2)]
+        for k in (k for k in range(n - 1) if bool(turning[k] & turning[k + 1])):
+            for sign in (1.0, -1.0):
+                coupled = one.clone()
+                coupled[k + 1, k] = sign
+                mixed.append(self.starts(coupled, self.zeros(4), 3))
+        if not bool(large.any()) and mixed:
+            yield _joined(mixed)
+        for number, factor in enumerate(self.factors() if bool((large | small | ~turning).all()) else ()):
+            part = (factor * span / width)[turning]
+            if bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
+                own = self.starts(torch.where(turning, factor, 1.0)[:, None] * one, self.zeros(ZEROS // 2))
+                yield own._replace(scaled=(turning & (number < 2)).expand_as(own.offset))  # limits are rough
+        for odd in (large, large | small):
+            if 0 < int(odd.sum()) < max(int(turning.sum()), 2):
+                own = self.starts(one, self.zeros(ZEROS))
+                grid = torch.rand(own.offset.shape, generator=seeded(1), dtype=torch.float64, device=HOST)
+                size = torch.where(odd, 0.08 * 12.0**grid * width / span.clamp(min=1e-9), 1.0)
+                yield own._replace(matrix=own.matrix * size[..., None], scaled=odd.expand_as(own.offset))
+
+    def _sizes(self) -> tuple[Tensor, Tensor]:
+        """Width of the limits, and range of the values as read, (n,) each."""
+        return self.room[:, 1] - self.room[:, 0], self.q.amax(0) - self.q.amin(0)
+
+    def _exchanged(self, a: int, b: int) -> list[int]:
+        return [b if k == a else a if k == b else k for k in range(self.robot.n)]
+
+    def factors(self) -> list[Tensor]:
+        """-100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read."""
+        width = self._sizes()[0]
+        ticks = [2 * pi / 2**k * self.per_rad for k in range(8, 25)]
+        plain = [value * torch.ones_like(width) for value in (pi / 180, 180 / pi, *ticks)]
+        return [width / 200.0 * self.per_rad, width / 100.0 * self.per_rad, *plain]
+
+    def zeros(self, count: int) -> Tensor:
+        """None, the middle of the limits, and random right angles: (count, n)."""
+        generator, shape = seeded(0), (count, self.robot.n)
+        quarters = torch.randint(-1, 3, shape, generator=generator, device=HOST) * (pi / 2)
+        drawn = torch.rand(shape, generator=generator, dtype=torch.float64, device=HOST) < 0.5
+        found = torch.where(drawn & self.turning, quarters, 0.0).double()
+        found[0], found[1] = 0.0, self.room.mean(1)
+        return found
+
+    def starts(self, matrix: Tensor, zeros: Tensor, most: int = 4, *, fewer: bool = True) -> _Starts:
+        """One matrix with up to ``most`` changes of sign, and zeros (K, n), half as many for each change."""
+        n, matrices, offsets = self.robot.n, [], []
+        for flips in (own for count in range(most + 1) for own in combinations(range(n), count)):
+            sign = torch.ones(n, 1, dtype=torch.float64, device=HOST)
+            sign[list(flips)] = -1.0
+            offsets.append(zeros[: max(len(zeros) >> len(flips), 2)] if fewer else zeros)
+            matrices.append((sign * matrix).expand(len(offsets[-1]), n, n))
+        offset = torch.cat(offsets)
+        none = torch.zeros_like(offset, dtype=torch.bool)
+        return _Starts(torch.cat(matrices), offset, ~none, none, torch.full_like(offset[:, 0], torch.inf))
+
+    def best(self, starts: _Starts) -> _Starts:
+        """The most promising, improved; the best first."""
+        starts = self.improved(starts, FIRST_STEPS)
+        found = self.improved(_chosen(starts, starts.share.argsort()[:KEPT]), STEPS)
+        order = found.share.argsort()
+        return _chosen(found, order[found.share[order] < PROMISING])
+
+    def equivalents(self, found: _Starts) -> _Starts:
+        """One of the starts (1,), and those with other signs and half turns that explain as much, few signs first."""
+        n, turns = self.robot.n, self.robot.periodic
+        halves = [(), *((k,) for k in range(n)), *((k, k + gap) for gap in (2, 3) for k in range(n - gap))]
+        added = [[pi if k in own else 0.0 for k in range(n)] for own in halves if all(turns[k] for k in own)]
+        zeros = found.offset + torch.tensor(added, dtype=torch.float64, device=HOST)
+        bare = found.matrix[0] * torch.where(found.matrix[0].diagonal() < 0.0, -1.0, 1.0)[:, None]
+        starts = self.starts(bare, zeros, fewer=False)
+        tried = self.improved(starts._replace(scaled=found.scaled.expand_as(starts.offset)), 2)
+        tried = self.improved(_chosen(tried, tried.share < PROMISING + float(found.share)), FIRST_STEPS)
+        good = _chosen(tried, tried.share < max(NICE, KEEPS * float(found.share)))
+        return _joined([good, found])
+
+    def plainer(self, found: _Starts) -> tuple[Tensor, Tensor]:
+        """M and b of one of the starts (1,), with known factors and the plainest zeros that explain as much."""
+        limit, (width, _) = max(NICE, KEEPS * float(found.share)), self._sizes()
+        identity = torch.eye(self.robot.n, dtype=torch.bool, device=HOST)
+        known = torch.stack([*self.factors(), *(torch.ones_like(width) / ratio for ratio in (1, *RATIOS))])
+        for k in found.scaled[0].nonzero()[:, 0].tolist():
+            near = known[(known[:, k] / found.matrix[0, k].abs().max() - 1.0).abs() < 0.05, k]
+            tried = _joined([found] * max(len(near), 1))
+            if len(near):
+                matrix = torch.where(identity[k][:, None], tried.matrix.sign() * near[:, None, None], tried.matrix)
+                found = self._taken(found, tried._replace(matrix=matrix, scaled=tried.scaled & ~identity[k]), limit)
+        for k in range(self.robot.n):
+            ends = [float(self.room[k].mean()), *self.room[k].tolist()]
+            nice = [0.0, *([pi / 2, -pi / 2, pi] if bool(self.turning[k]) else []), *ends]
+            tried = _joined([found] * len(nice))
+            values = torch.tensor(nice, dtype=torch.float64, device=HOST)[:, None]
+            offset = torch.where(identity[k], values, tried.offset)
+            found = self._taken(found, tried._replace(offset=offset, free=tried.free & ~identity[k]), limit)
+        turned = pi - (pi - found.offset[0]).remainder(2 * pi)
+        rounded = torch.where(
+            self.turning, turned.rad2deg().round(decimals=1).deg2rad(), found.offset[0].round(decimals=4)
+        )
+        return found.matrix[0], torch.where(found.free[0], rounded, found.offset[0])
+
+    def _taken(self, now: _Starts, tried: _Starts, limit: float) -> _Starts:
+        """The first that leaves little and about as little as the best of them, else what there was."""
+        tried = self.improved(tried, LAST_STEPS)
+        good = (tried.share < min(limit, 1.5 * max(float(tried.share.min()), NICE / 3))).nonzero()[:1, 0]
+        return _chosen(tried, good) if len(good) else now
+
+    def improved(self, starts: _Starts, steps: int) -> _Starts:
+        """Damped least squares in the zeros, the sought factors and the marker's place on the tip."""
+        matrix, offset, n = starts.matrix, starts.offset, self.robot.n
+        marker, damping = offset.new_zeros(len(offset), 3), offset.new_full((len(offset),), 1e-2)
+        now = self._unexplained(matrix, offset, marker)
+        for _ in range(steps):
+            residual, slopes, turned, share = now
+            by_size = slopes * ((matrix.sign() @ self.q.mT).mT[:, :, None] * starts.scaled[:, None, None])
+            design = torch.cat([slopes * starts.free[:, None, None], by_size, turned], 3).flatten(2)
+            design = (self.projector @ design).unflatten(2, (3, -1)).flatten(1, 2)
+            normal, gradient = design.mT @ design, (design.mT @ residual.flatten(1)[..., None])[..., 0]
+            size = normal.diagonal(dim1=1, dim2=2)
+            damped = normal + torch.diag_embed(damping[:, None] * (size + 1e-3 * size.amax(1, True)) + 1e-9)
+            step, sizes = -torch.linalg.solve(damped, gradient), matrix.abs().amax(2)
+            scaled = matrix * ((sizes + step[:, n : 2 * n]).clamp(min=1e-9) / sizes)[..., None]
+            moved = offset + step[:, :n].clamp(-LARGEST_STEP, LARGEST_STEP)
+            tried = scaled, moved, (marker + step[:, 2 * n :]).clamp(-MARKER_M, MARKER_M)
+            then = self._unexplained(*tried)
+            better = then[3] < share
+            pairs = zip((matrix, offset, marker, *now), (*tried, *then), strict=True)
+            matrix, offset, marker, *now = (
+                torch.where(better.view(-1, *[1] * (old.ndim - 1)), new, old) for old, new in pairs
+            )
+            damping = torch.where(better, damping / 4, damping * 4).clamp(1e-6, 1e6)
+        return starts._replace(matrix=matrix, offset=offset, share=now[3])
+
+    def _unexplained(self, matrix: Tensor, offset: Tensor, marker: Tensor) -> list[Tensor]:
+        """What no frame explains (B, N, 3), slopes by joints (B, N, 3, n), rotations (B, N, 3, 3), share (B,)."""
+        robot, shape = self.robot, (len(matrix), len(self.q))
+        places = robot.places((self.q @ matrix.mT + offset[:, None]).flatten(0, 1))
+        end = places[:, robot.tip_places][:, self.tip]
+        p = end[:, :3, 3] + (end[:, :3, :3] @ marker.repeat_interleave(shape[1], 0)[..., None])[..., 0]
+        moved = robot.ancestors[robot.tip_places][self.tip : self.tip + 1]
+        slopes = robot.point_slopes(places[:, : robot.moving], p[:, None], moved)[:, 0].unflatten(0, shape)
+        p = p.unflatten(0, shape)
+        residual, spread = self.projector @ p, (p - p.mean(1, keepdim=True)).square().sum((1, 2))
+        share = (residual.square().sum((1, 2)) / spread.clamp(min=1e-12)).sqrt()
+        return [residual, slopes, end[:, :3, :3].unflatten(0, shape), share]
+
+
+def _chosen(starts: _Starts, rows: Tensor) -> _Starts:
+    return _Starts(*(part[rows] for part in starts))
+
+
+def _joined(parts: list[_Starts]) -> _Starts:
+    return _Starts(*map(torch.cat, zip(*parts, strict=True)))

@@ -1,0 +1,106 @@
+"""Joints as linear expressions of columns: what they mean, their inverse, and every reader and writer of tables."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.csv.files import read_joints, write_measurements
+from diffeo_calib.measurements.csv.tables import TableOrigin
+from diffeo_calib.measurements.csv.writing import Program
+from diffeo_calib.measurements.table_format import TableFormat
+
+
+@pytest.mark.parametrize(
+    ("text", "factors", "constant"),
+    [
+        ("J1", {"J1": 1.0}, 0.0),
+        ("-J2+90", {"-J2+90": 1.0}, 0.0),
+        ("Base (deg) {x}", {"Base (deg) {x}": 1.0}, 0.0),
+        ("-{J2}+90", {"J2": -1.0}, 90.0),
+        ("{J3} + {J2}", {"J3": 1.0, "J2": 1.0}, 0.0),
+        ("0.5*{J4}", {"J4": 0.5}, 0.0),
+        ("{Joint-4 [deg]}/2 - 1e-1", {"Joint-4 [deg]": 0.5}, -0.1),
+        ("360/4096*{ticks5}-180", {"ticks5": 360 / 4096}, -180.0),
+        ("180/pi*{q}+pi/2", {"q": 180 / math.pi}, math.pi / 2),
+        ("+{a}-{b}*2+{a}", {"a": 2.0, "b": -2.0}, 0.0),
+    ],
+)
+def test_what_a_text_means(text: str, factors: dict[str, float], constant: float) -> None:
+    found = JointExpressions.of([text])
+    assert dict(zip(found.columns, found.matrix[0].tolist(), strict=True)) == pytest.approx(factors)
+    assert float(found.offset) == pytest.approx(constant)
+    assert bool(found.plain) == ("{" not in text or text.endswith("{x}"))
+
+
+@pytest.mark.parametrize("text", ["{a}*{b}", "1/{a}", "{a}/0", "{a}+1/0"])
+def test_what_is_not_linear_is_refused(text: str) -> None:
+    with pytest.raises(MeasurementError, match=r"expected a linear expression of columns.*sums of terms"):
+        JointExpressions.of([text])
+
+
+def test_cells_are_the_inverse_of_values() -> None:
+    found = JointExpressions.of(["-{a}+90", "{b}+{a}", "360/4096*{c}-180"])
+    cells = torch.rand(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert_close(found.cells(found.values(cells)), cells, rtol=0, atol=1e-9)
+    assert_close(found.values(cells)[:, 1], cells[:, 0] + cells[:, 1])
+
+
+@pytest.mark.parametrize("texts", [["{a}+{b}"], ["{a}", "2*{a}+1"], ["{a}+{b}", "{c}"]])
+def test_columns_that_the_joints_do_not_tell_are_not_written(texts: list[str]) -> None:
+    with pytest.raises(MeasurementError, match="columns that the joints determine"):
+        JointExpressions.of(texts).cells(torch.zeros(2, len(texts), dtype=torch.float64))
+
+
+def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
+    """Degrees, a coupled joint and a slide in mm; the file keeps its columns, the data the robot's names."""
+    texts, kinds = ["-{A}+90", "{B}+{A}", "{s}+5"], ["revolute", "revolute", "prismatic"]
+    table = TableFormat("mm", "deg")
+    cells = [[10.0, 20.0, 7.0], [-30.0, 5.0, 9.5]]
+    rows = ["note,s,A,B,x,y,z", *(f"n,{s},{a},{b},100,200,{k}" for k, (a, b, s) in enumerate(cells))]
+    (tmp_path / "t.csv").write_text("\n".join(rows))
+    expected = torch.tensor(
+        [[math.radians(90 - a), math.radians(a + b), (s + 5) / 1e3] for a, b, s in cells], dtype=torch.float64
+    )
+    assert_close(read_joints(tmp_path / "t.csv", texts, table, kinds=kinds), expected)
+    data = dc.read_measurements(
+        tmp_path / "t.csv", ["j1", "j2", "j3"], ["x", "y", "z"], joints=texts, kinds=kinds, length="mm", angle="deg"
+    )
+    assert data.joint_names == ("j1", "j2", "j3")
+    assert_close(data.q, expected)
+    assert isinstance(data.origin, TableOrigin)
+    assert "--joints '-{A}+90,{B}+{A},{s}+5'" in data.origin.options
+    write_measurements(tmp_path / "again.csv", data, table, joints=texts, kinds=kinds)
+    assert (tmp_path / "again.csv").read_text().startswith("A,B,s,x,y,z")
+    assert_close(read_joints(tmp_path / "again.csv", texts, table, kinds=kinds), expected)
+    columns = Columns.of(table, texts, kinds, [])
+    program = Program.read(tmp_path / "t.csv", table)
+    program.write(tmp_path / "new.csv", expected + 0.01, columns, {}, table)
+    assert_close(read_joints(tmp_path / "new.csv", texts, table, kinds=kinds), expected + 0.01)
+
+
+def test_a_joint_twice_or_a_column_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n")
+    table = TableFormat("m", "rad")
+    with pytest.raises(MeasurementError, match=r"no column \['c'\]"):
+        read_joints(tmp_path / "t.csv", ["a", "-{c}"], table)
+    with pytest.raises(MeasurementError, match="twice"):
+        read_joints(tmp_path / "t.csv", ["a", "a"], table)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+def test_units_of_length(unit: str, metres: float, tmp_path: Path) -> None:
+    lengths = [f"{value / metres!r}" for value in (0.4, 1.0, 2.0, 3.0)]
+    (tmp_path / "t.csv").write_text(f"a,s,x,y,z\n0.5,{','.join(lengths)}\n")
+    how = {"length": unit, "angle": "rad", "kinds": ["revolute", "prismatic"]}
+    data = dc.read_measurements(tmp_path / "t.csv", ["a", "s"], ["x", "y", "z"], **how)
+    assert_close(data.points[0, 0], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    assert float(data.q[0, 1]) == pytest.approx(0.4)
