@@ -91,15 +91,15 @@ def seen_grid(text: str, number: int = 0, squares: bool = False) -> np.ndarray:
     scale = 800 / float(np.ptp(board.points[:, 0]))
     low = np.min([c.min(0) for c in board.layout.values()], 0)
     corners = {k: np.rint(scale * (c - low)[:, :2]).astype(int) + 100 for k, c in board.layout.items()}
-    sheet = np.full((*(np.max([c.max(0) for c in corners.values()], 0) + 100)[::-1],), 255, np.uint8)
+    wide, high = (int(size) + 100 for size in np.max([c.max(0) for c in corners.values()], 0))
+    sheet = np.full((high, wide), 255, np.uint8)
     gap = round(scale * float(text.split(":")[3]))
     for k, c in corners.items():
-        (x, y), side = c.min(0), int(np.ptp(c[:, 0]))
+        x, y, side = *c.min(0).tolist(), int(np.ptp(c[:, 0]))
         sheet[y : y + side, x : x + side] = cv2.aruco.generateImageMarker(markers, k, side)
         for column, row in ((x - gap, y - gap), (x + side, y - gap), (x - gap, y + side), (x + side, y + side)):
             if squares:
                 sheet[row : row + gap, column : column + gap] = 0
-    high, wide = sheet.shape
     frame = np.array([[0, 0], [wide, 0], [wide, high], [0, high]], np.float32)
     moved = np.random.default_rng(number).uniform(-40, 40, (4, 2))
     H = cv2.getPerspectiveTransform(frame, (frame * min(1000 / wide, 760 / high) + 80 + moved).astype(np.float32))
