@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,17 +16,21 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
+from diffeo_calib.calibration.diagnostics.unmeasured_markers import unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
+from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     COVARIATES,
     LENS,
     PAYLOADS,
     SESSIONS,
     SOME_LENS,
+    JointColumns,
     Sheet,
     guess_column,
     guess_deviations,
+    guess_matrix,
     guess_positions,
     guess_readings,
     guess_rotation,
@@ -57,6 +60,8 @@ FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
+BELOW = (12, 13, 14)
+"""Places of the zeros below a rotation, of a matrix by rows."""
 LARGEST_RESIDUAL = 0.1
 """Median residual of a registration, m, or without positions as a share, above which no reading is right."""
 LARGEST_DEVIATION = 0.01
@@ -85,6 +90,7 @@ class RowColumns:
     Args:
         markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
             or its set-up. payload: of the mass carried. covariates: option, time or temperature -> column.
+        matrix: the nine of the rotation, by rows, where poses are written as matrices. left: what is not used, and why.
     """
 
     markers: list[list[str]]
@@ -93,6 +99,8 @@ class RowColumns:
     session: str | None
     payload: str | None
     covariates: dict[str, str] = field(default_factory=dict)
+    matrix: Sequence[str] = ()
+    left: Sequence[str] = ()
 
     @property
     def without_length(self) -> bool:
@@ -109,6 +117,7 @@ class RowColumns:
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
             yield Choice("position", names, f"{len(names)} marker(s), by their names")
+        yield from (Choice("", "", f"{text}; not used") for text in self.left)
         if self.sockets:
             yield Choice(
                 "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
@@ -126,29 +135,46 @@ class RowColumns:
             yield Choice("session", self.session, why)
         if self.payload is not None:
             yield Choice("payload", self.payload, "by its name: the known mass that the robot carried")
-        for option, column in self.covariates.items():
-            yield Choice(
-                option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
-            )
+        for option, name in self.covariates.items():
+            yield Choice(option, name, "by its name: a drift with it is sought, and kept where left-out rows prove it")
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""
     sockets = guess_sockets(sheet.header) or []
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
+    markers, unmeasured = guess_positions([name for name in with_gaps if name not in joints])
+    left = [f"{few(names)}: {why}" for names, why in unmeasured]
     others = [name for name in sheet.numbers if name not in joints]
+    matrix = () if markers else _matrix_in(csv, sheet, others)
+    markers = markers or [list(own) for own in matrix[:1]]
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
+        got = "; ".join(left) or few(sheet.numbers, 20)
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
     named = [name for name in sheet.header if name not in joints]
     session = None if sockets and not readings else guess_column(named, SESSIONS)
     guessed = {option: guess_column(others, words) for option, words in COVARIATES.items()}
-    drifting = {option: column for option, column in guessed.items() if column is not None}
-    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting)
+    drifting = {option: name for option, name in guessed.items() if name is not None}
+    nine = [name for own in matrix[1:] for name in own]
+    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting, nine, left)
+
+
+def _matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
+    """Position and rotation, by rows, of poses that are written as 16 numbers by rows or columns; none without them."""
+    found = guess_matrix(columns)
+    if found is None:
+        return ()
+    names, named = found
+    header, rows = read_cells(csv, sheet.sep)
+    by_rows = named or all(
+        number(cells[header.index(names[k])], sheet.decimal) == 0 for _, cells in rows for k in BELOW
+    )
+    entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
+    return [row[3] for row in entries], [name for row in entries for name in row[:3]]
 
 
 def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
@@ -181,8 +207,8 @@ def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]]
 
 def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
     """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
-    known = {leaf.lower(): leaf for leaf in leaves}
-    found = [known.get(re.sub(r"[_\-. ]?[xX]$", "", triple[0]).lower()) for triple in markers]
+    known = {column(leaf).plain: leaf for leaf in leaves}
+    found = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in markers]
     tips = [tip for tip in found if tip is not None]
     return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
@@ -304,6 +330,52 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
+def joint_columns(source: Source, sheet: Sheet, found: Sequence[JointColumns]) -> tuple[Source, list[Choice]]:
+    """The columns of the joints, and why: of those that names do not tell apart those that the nominal robot explains.
+
+    Where it does not tell them apart either, a remark for each asks the user.
+    """
+    best, *others = found
+    why, equal = best.how, [one for one in found if one.rank == best.rank]
+    clear = [(1.0, best)]
+    for length in ("m", "mm") if len(equal) > 1 else ():
+        formats = [TableFormat(length, angle, sheet.sep, sheet.decimal) for angle in ("rad", "deg")]
+        tried = [(residuals(replace(source, joints=one.names), dict(enumerate(formats)))[0][0], one) for one in equal]
+        (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
+        clear.append((second / least if 0 < least < inf else 1.0, own))
+    ratio, taken = max(clear, key=lambda entry: entry[0])
+    if len(equal) > 1 and ratio < gates.READINGS_TOLD_APART:
+        lines = [f"joints = {json.dumps(','.join(one.names))}  # uncomment the right line: {one.how}" for one in equal]
+        return replace(source, joints=best.names), [Choice("", "", line) for line in lines]
+    why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
+    why += "".join(f"; not {one.shown}" for one in [best, *others][:4] if one is not taken)
+    return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
+
+
+def measured(source: Source, sheet: Sheet) -> Source:
+    """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
+    found = dict[int, str]()
+    several = len(source.rows.markers) > 1
+    for units in product(("m", "mm"), ("rad", "deg")) if several else ():
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            positions = measured_positions(source.read(TableFormat(*units, sheet.sep, sheet.decimal)))
+            every = [] if positions is None else unmeasured_markers(source.robot, positions.largest_session())
+            found = found or {marker: words for marker, words, _ in every}
+    rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
+    left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
+    rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
+    return replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
+
+
+def other_units(source: Source, length: str, angle: str) -> list[str]:
+    """Columns of joints and positions whose names say other units."""
+    turning = [name for name, turns in zip(source.joints, source.robot.periodic, strict=True) if turns]
+    places = [name for triple in source.rows.markers for name in triple]
+    pairs = *product(turning, (angle,)), *product(places, (length,))
+    return [name for name, unit in pairs if column(name).unit not in ("", unit)]
+
+
 def residuals(source: Source, formats: Mapping[Any, TableFormat]) -> list[tuple[float, Any]]:
     """Median residual of the nominal robot in every format, and its key; the smallest first."""
     return sorted(((source.residual(table), key) for key, table in formats.items()), key=lambda found: found[0])
@@ -333,27 +405,39 @@ def _readings_of(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
 def rotation(source: Source) -> Iterator[Choice]:
     """A rotation: the convention with which the nominal robot explains the poses best.
 
-    Nothing if there are no such columns, or no convention is clearly better than all others; then a remark says so.
+    Nothing if there are no such columns; a remark if no convention is clearly better than all others.
     """
-    guessed = [guess_rotation(source.numbers, marker) for marker in source.rows.markers]
-    each = [names for names in guessed if names is not None and not set(names) & set(source.joints)]
-    alone = len(source.rows.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
-    if not each or len(each) < len(guessed) or not alone or len(guessed) != max(len(source.tips), 1):
+    others, matrix = [name for name in source.numbers if name not in source.joints], list(source.rows.matrix)
+    guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
+    found = [(matrix, "a matrix")] if matrix else [one for one in guessed if one is not None]
+    each, usual = [names for names, _ in found], " or ".join(dict.fromkeys(words for _, words in found))
+    names = list(dict.fromkeys(name for own in each for name in own))
+    tips = len(source.rows.markers) == max(len(source.tips), 1) == len(each)
+    if not each:
         return
-    names = [name for own in each for name in own]
-    columns = each[0] if len(each) == 1 else each
-    formats = {
-        (name, unit): replace(source.table, rotation=columns, convention=name, rotation_angle=unit)
-        for name, unit in _readings_of(each[0])
-    }
-    found = _clear_rotation(source, formats, "with any other convention or unit")
-    if found is None:
-        yield Choice("", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used")
+    best = None
+    if tips and len(names) == sum(map(len, each)):
+        formats = {
+            (name, unit): replace(source.table, rotation=each[0] if len(each) == 1 else each, **turn)
+            for name, unit in _readings_of(each[0])
+            for turn in [{"convention": name, "rotation_angle": unit}]
+        }
+        best = _clear_rotation(source, formats, "with any other convention or unit")
+    if best is None:
+        what = (
+            "rotations of no convention that is clearly better than others" if tips else "the rotation of another body"
+        )
+        yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
         return
-    (convention, unit), reason = found
+    (convention, unit), reason = best
     written = [",".join(own) for own in each]
     why = "by their names; without these three lines positions alone are calibrated"
-    yield Choice("rotation", written[0] if len(written) == 1 else written, why)
+    yield from _turn(written[0] if len(written) == 1 else written, why, convention, reason, unit)
+
+
+def _turn(names: str | list[str], why: str, convention: str, reason: str, unit: str | None) -> Iterator[Choice]:
+    """Entries of a rotation, its convention and its unit."""
+    yield Choice("rotation", names, why)
     yield Choice("convention", convention, reason)
     if unit is not None:
         yield Choice("rotation-angle", unit, "the same")
@@ -364,9 +448,11 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
 
     Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
     """
-    names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
-    if names is None or set(names) & set(source.joints):
+    others = [name for name in source.numbers if name not in source.joints]
+    guessed = guess_rotation(others, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
+    if guessed is None:
         return
+    names = guessed[0]
     formats = {
         (length, angle, *turn): TableFormat(length, angle, sheet.sep, sheet.decimal, names, *turn, camera_on_tool=True)
         for length, angle, turn in product(("m", "mm"), ("rad", "deg"), list(_readings_of(names)))
@@ -377,12 +463,8 @@ def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
     (length, angle, convention, unit), reason = found
     yield Choice("length", length, reason)
     yield Choice("angle", angle, "the same")
-    yield Choice(
-        "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
-    )
-    yield Choice("convention", convention, "the same")
-    if unit is not None:
-        yield Choice("rotation-angle", unit, "the same")
+    why = "by their names: poses of a fixed board in the frame of a camera on the tool"
+    yield from _turn(",".join(names), why, convention, "the same", unit)
     yield Choice("camera-on-tool", True, "the nominal robot explains the inverse poses alone")
 
 

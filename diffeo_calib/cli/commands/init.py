@@ -12,7 +12,7 @@ from pathlib import Path
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
+from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet, joints_without_column
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
@@ -52,39 +52,46 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     folder = output.parent
     yield Choice("csv", relpath(csv, folder), "the table")
     yield Choice("robot", relpath(urdf, folder), "the URDF")
-    base, tip, (joints, how), why = _chain(urdf, sheet)
+    base, tip, joints, why = _chain(urdf, sheet)
     rows = proposals.rows_in(csv, sheet, joints)
     tips = proposals.tips_of(rows.markers, [leaf for _, leaf, _ in chains_in(urdf)])
     chain = load_urdf(urdf, base, list(dict.fromkeys(tips)) or tip)
-    if tips:
-        joints, how = guess_joints(sheet.numbers, chain.joint_names) or (joints, how)
-    yield Choice("base", base, why)
-    leaf = "a leaf below it; the markers are fixed to it or to a link before it"
-    yield Choice("tip", tips, "leaves after which the columns are named") if tips else Choice("tip", tip, leaf)
-    yield Choice("joints", ",".join(joints), how)
-    yield from rows.entries()
-    yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
-    yield Choice("decimal", sheet.decimal, "the same")
     seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
+    seen, names = proposals.joint_columns(seen, sheet, guess_joints(sheet.numbers, chain.joint_names))
+    seen = proposals.measured(seen, sheet)
     units = list(_units(seen, sheet))
-    yield from units
     found = {choice.name: str(choice.value) for choice in units}
     table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
+    seen = replace(seen, table=table)
+    yield Choice("base", base, why)
+    leaf = "a leaf below it; the markers are fixed to it or to a link before it"
+    several = Choice("tip", list(seen.tips), "leaves after which the columns are named")
+    yield several if tips else Choice("tip", tip, leaf)
+    yield from names
+    yield from seen.rows.entries()
+    yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
+    yield Choice("decimal", sheet.decimal, "the same")
+    yield from units
+    others = proposals.other_units(seen, table.length, table.angle)
+    if others:
+        yield Choice("", "", f"{few(others)}: the names say another unit than the robot finds in the numbers: check it")
     if "rotation" not in found:
-        yield from proposals.beside(replace(seen, table=table), sheet)
+        yield from proposals.beside(seen, sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
-def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
+def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, list[str], str]:
     """First and last link of the longest chain whose joints the table has, and the columns of its joints."""
     chains = chains_in(urdf)
     for base, tip, joints in chains:
-        found = guess_joints(sheet.numbers, joints) if joints else None
-        if found is not None:
-            return base, tip, found, f"root of the URDF; {len(joints)} joints to {tip}"
+        found = guess_joints(sheet.numbers, joints) if joints else []
+        if found:
+            return base, tip, found[0].names, f"root of the URDF; {len(joints)} joints to {tip}"
     expected = " or ".join(few(joints, 20) for _, _, joints in chains[:3]) or "a robot with joints"
-    raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
+    missing = joints_without_column(sheet.numbers, chains[0][2])
+    fix = f"no column is named after {few(missing, 20)}: name the columns as the joints, or q1, q2, ... in their order"
+    raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
 
 
 def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
@@ -101,6 +108,9 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
     }
     (best, (length, angle, camera)), *others = found = proposals.residuals(source, formats)
     if not proposals.is_clear(found, CLEAR_RATIO):
+        named = [entry for entry in found if not proposals.other_units(source, *entry[1][:2])]
+        (best, (length, angle, camera)), *others = found = named or found
+    if not proposals.is_clear(found, CLEAR_RATIO):
         poses = list(proposals.camera(source, sheet))
         if best == inf and not poses:
             source.read_residual(TableFormat(length, angle, *marks))  # says why
@@ -112,7 +122,7 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
             raise InputError.of(what, expected="one clear reading", got=got, fix=fix)
         yield from poses
         return
-    why = source.words(best, others[0][0])
+    why = source.words(best, others[0][0]) if others else "by the names of the columns: the numbers leave it open"
     yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
     yield Choice("angle", angle, why if no_length else "the same")
     if camera:
