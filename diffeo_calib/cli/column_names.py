@@ -11,16 +11,20 @@ from itertools import pairwise
 from typing import NamedTuple
 
 ROLES = {
-    "measured": "actual act measured meas measure measurement msr ist reported encoder enc feedback fb observed "
-    "observation obs gemessen mesure misurato medido reel real 实际 实测 実測 測定",
-    "wished": "target cmd command commanded goal desired des soll sollwert ziel vorgabe setpoint sp ref reference "
-    "nominal nom plan planned wish wished wanted demand demanded ideal action theoretical theo calculated calc "
-    "computed fk sim simulated predicted expected consigne cible theorique nominale comando riferimento deseado "
-    "objetivo teorico 目標 目标 指令 理论 設定",
+    "measured": "actual act measured meas measure measurement msr ist istwert reported encoder enc feedback fb "
+    "observed observation obs gemessen mess messung messwert mesure mesuree misurato misurata medido medida real reale reel "
+    "gemeten zmierzone "
+    "实际 实测 実測 実測値 測定 測定値",
+    "wished": "target cmd command commanded goal desired des soll sollwert ziel vorgabe geplant nenn referenz sp ref "
+    "setpoint reference nominal nom plan planned wish wished wanted demand demanded ideal action theoretical theo calc "
+    "calculated computed fk sim simulated predicted expected consigne cible commande theorique nominale comando "
+    "riferimento deseado desejado objetivo teorico teorica gewenst zadane "
+    "目標 目標値 目标 指令 指令値 理论 設定 設定値",
     "deviation": "std stddev stdev dev deviation sigma err error uncertainty unc rms var residual",
     "rate": "vel velocity velocities speed qd dq qdot dot acc accel acceleration qdd ddq gyro imu tau torque torques "
     "effort moment force wrench ft current currents voltage volt power temp temperature mode control window momentum "
-    "load pressure status nm",
+    "load pressure status nm "
+    "strom drehmoment geschwindigkeit vitesse couple",
     "turn": "rot rotation euler quat quaternion ang angle angles orientation ori rotvec rpy phi q",
     "place": "t p pos position trans translation point",
     "tool": "tcp pose ee cartesian cart tool marker point",
@@ -123,8 +127,8 @@ def _parts(word: str) -> list[str]:
     """A word, divided where an axis or q is glued to another one: tx, xist, qcmd."""
     if word[-1] in "xyz" and word[:-1] in GLUED:
         return [GLUED[word[:-1]], word[-1]]
-    if word[0] in "xyzqj" and word[1:] in SAID | {"pos"}:
-        return [word[0], word[1:]]
+    if word[0] in "xyzqj" and word[1:] in SAID | {"pos", "m", "mm"}:
+        return [word[0], "meas" if word[1:] == "m" else word[1:]]
     return [word]
 
 

@@ -330,17 +330,15 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
-def joint_columns(source: Source, sheet: Sheet, found: Sequence[JointColumns]) -> tuple[Source, list[Choice]]:
+def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source, list[Choice]]:
     """The columns of the joints, and why: of those that names do not tell apart those that the nominal robot explains.
 
     Where it does not tell them apart either, a remark for each asks the user.
     """
-    best, *others = found
-    why, equal = best.how, [one for one in found if one.rank == best.rank]
-    clear = [(1.0, best)]
+    best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
     for length in ("m", "mm") if len(equal) > 1 else ():
-        formats = [TableFormat(length, angle, sheet.sep, sheet.decimal) for angle in ("rad", "deg")]
-        tried = [(residuals(replace(source, joints=one.names), dict(enumerate(formats)))[0][0], one) for one in equal]
+        tables = {angle: replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")}
+        tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
         (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
         clear.append((second / least if 0 < least < inf else 1.0, own))
     ratio, taken = max(clear, key=lambda entry: entry[0])
@@ -348,18 +346,17 @@ def joint_columns(source: Source, sheet: Sheet, found: Sequence[JointColumns]) -
         lines = [f"joints = {json.dumps(','.join(one.names))}  # uncomment the right line: {one.how}" for one in equal]
         return replace(source, joints=best.names), [Choice("", "", line) for line in lines]
     why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
-    why += "".join(f"; not {one.shown}" for one in [best, *others][:4] if one is not taken)
+    why += "".join(f"; not {one.shown}" for one in found[:4] if one is not taken)
     return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
 
 
-def measured(source: Source, sheet: Sheet) -> Source:
+def measured(source: Source) -> Source:
     """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
-    found = dict[int, str]()
-    several = len(source.rows.markers) > 1
-    for units in product(("m", "mm"), ("rad", "deg")) if several else ():
+    found, several = dict[int, str](), len(source.rows.markers) > 1
+    for length, angle in product(("m", "mm"), ("rad", "deg")) if several else ():
         with warnings.catch_warnings(), suppress(DiffeoCalibError):
             warnings.simplefilter("ignore")
-            positions = measured_positions(source.read(TableFormat(*units, sheet.sep, sheet.decimal)))
+            positions = measured_positions(source.read(replace(source.table, length=length, angle=angle)))
             every = [] if positions is None else unmeasured_markers(source.robot, positions.largest_session())
             found = found or {marker: words for marker, words, _ in every}
     rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
@@ -387,85 +384,49 @@ def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
     return best < LARGEST_RESIDUAL and all(value >= ratio * best for value, _ in others)
 
 
-def _clear_rotation(source: Source, formats: Mapping[Any, TableFormat], other: str) -> tuple[Any, str] | None:
-    """The format, by its key, that explains poses clearly better than all others, which ``other`` names; and why."""
-    (best, key), *others = found = residuals(source, formats)
-    if not is_clear(found, gates.READINGS_TOLD_APART):
-        return None
-    than = f", {other} at least {1e3 * others[0][0]:.3g} mm" if others and others[0][0] < inf else ""
-    return key, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
+    """A rotation: the convention with which the nominal robot explains the poses clearly better than with all others.
 
-
-def _readings_of(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Conventions and units in which so many columns can hold a rotation."""
-    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
-    return product(conventions, ("deg", "rad") if len(names) == 3 else (None,))
-
-
-def rotation(source: Source) -> Iterator[Choice]:
-    """A rotation: the convention with which the nominal robot explains the poses best.
-
-    Nothing if there are no such columns; a remark if no convention is clearly better than all others.
+    With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. Nothing if there
+    are no columns of a rotation; a remark, but for a camera, if no convention is clearly better.
     """
-    others, matrix = [name for name in source.numbers if name not in source.joints], list(source.rows.matrix)
+    others, table = [name for name in source.numbers if name not in source.joints], source.table
     guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
-    found = [(matrix, "a matrix")] if matrix else [one for one in guessed if one is not None]
-    each, usual = [names for names, _ in found], " or ".join(dict.fromkeys(words for _, words in found))
-    names = list(dict.fromkeys(name for own in each for name in own))
-    tips = len(source.rows.markers) == max(len(source.tips), 1) == len(each)
-    if not each:
+    found = [(source.rows.matrix, "a matrix")] if source.rows.matrix else [one for one in guessed if one is not None]
+    if not found:
         return
-    best = None
-    if tips and len(names) == sum(map(len, each)):
-        formats = {
-            (name, unit): replace(source.table, rotation=each[0] if len(each) == 1 else each, **turn)
-            for name, unit in _readings_of(each[0])
-            for turn in [{"convention": name, "rotation_angle": unit}]
-        }
-        best = _clear_rotation(source, formats, "with any other convention or unit")
-    if best is None:
-        what = (
-            "rotations of no convention that is clearly better than others" if tips else "the rotation of another body"
-        )
-        yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
+    each, names = [list(own) for own, _ in found], list(dict.fromkeys(name for own, _ in found for name in own))
+    own_body = len(source.rows.markers) == max(len(source.tips), 1) == len(each) and len(names) == sum(map(len, each))
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])] if own_body else []
+    turns = product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,))
+    units = product(("m", "mm"), ("rad", "deg")) if camera else [(table.length, table.angle)]
+    columns = each[0] if len(each) == 1 else each
+    formats = {
+        (*unit, *turn): TableFormat(*unit, table.sep, table.decimal, columns, *turn, camera_on_tool=camera)
+        for unit, turn in product(units, turns)
+    }
+    clear = residuals(source, formats)
+    if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
+        what = "rotations of no convention that is clearly better than others" if own_body else "turns of another body"
+        usual = " or ".join(dict.fromkeys(words for _, words in found))
+        if not camera:
+            yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
         return
-    (convention, unit), reason = best
+    (best, (length, angle, convention, unit)), *worse = clear
+    why = f"median residual of the nominal robot {1e3 * best:.3g} mm"
+    why += f", read in any other way at least {1e3 * worse[0][0]:.3g} mm" if worse and worse[0][0] < inf else ""
     written = [",".join(own) for own in each]
-    why = "by their names; without these three lines positions alone are calibrated"
-    yield from _turn(written[0] if len(written) == 1 else written, why, convention, reason, unit)
-
-
-def _turn(names: str | list[str], why: str, convention: str, reason: str, unit: str | None) -> Iterator[Choice]:
-    """Entries of a rotation, its convention and its unit."""
-    yield Choice("rotation", names, why)
-    yield Choice("convention", convention, reason)
+    if camera:
+        yield Choice("length", length, why)
+        yield Choice("angle", angle, "the same")
+        yield Choice(
+            "camera-on-tool", True, "the nominal robot explains poses of a fixed board alone, seen from the tool"
+        )
+    without = "without these three lines positions alone are calibrated"
+    yield Choice("rotation", written[0] if len(written) == 1 else written, f"by their names; {without}")
+    yield Choice("convention", convention, why)
     if unit is not None:
         yield Choice("rotation-angle", unit, "the same")
-
-
-def camera(source: Source, sheet: Sheet) -> Iterator[Choice]:
-    """Units and rotations that make the rows poses of a board seen by a camera on the tool.
-
-    Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
-    """
-    others = [name for name in source.numbers if name not in source.joints]
-    guessed = guess_rotation(others, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
-    if guessed is None:
-        return
-    names = guessed[0]
-    formats = {
-        (length, angle, *turn): TableFormat(length, angle, sheet.sep, sheet.decimal, names, *turn, camera_on_tool=True)
-        for length, angle, turn in product(("m", "mm"), ("rad", "deg"), list(_readings_of(names)))
-    }
-    found = _clear_rotation(source, formats, "read in any other way")
-    if found is None:
-        return
-    (length, angle, convention, unit), reason = found
-    yield Choice("length", length, reason)
-    yield Choice("angle", angle, "the same")
-    why = "by their names: poses of a fixed board in the frame of a camera on the tool"
-    yield from _turn(",".join(names), why, convention, "the same", unit)
-    yield Choice("camera-on-tool", True, "the nominal robot explains the inverse poses alone")
 
 
 def deviations(source: Source) -> Iterator[Choice]:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.likely_mistakes import residual_of
 from diffeo_calib.calibration.identification.registration import spread
-from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
@@ -48,7 +49,7 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         far = max(other for other, tip in zip(own, tips, strict=True) if tip == tips[k])
         if isfinite(far) and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
-            yield Unmeasured(k, f"{words}: wished places?", typical < gates.DIGITS_SHARE * size)
+            yield Unmeasured(k, words, typical < gates.DIGITS_SHARE * size)
 
 
 def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:
@@ -62,7 +63,8 @@ def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:
 def check_markers(robot: Tree, data: Measurements) -> None:
     """Refuse markers that are no measurements, with the proof; warn of doubtful ones."""
     for marker, words, proved in unmeasured_markers(robot, data):
-        expected, fix = "measured places of every marker", f"leave the columns of marker {marker} out"
+        names = data.origin.columns.triples[marker] if isinstance(data.origin, TableOrigin) else [f"marker {marker}"]
+        fix = f"leave {few(names)} out: wished or computed places, or the same marker twice, are no measurements"
         if proved:
-            raise MeasurementError.of(words, expected=expected, fix=fix)
-        warn_user(sentence(words, expected=expected, fix=f"{fix}, if they were not measured"))
+            raise MeasurementError.of(words, fix=fix)
+        warn_user(sentence(words, fix=f"if they were not measured, {fix}"))

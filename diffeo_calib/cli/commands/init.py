@@ -56,13 +56,12 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     rows = proposals.rows_in(csv, sheet, joints)
     tips = proposals.tips_of(rows.markers, [leaf for _, leaf, _ in chains_in(urdf)])
     chain = load_urdf(urdf, base, list(dict.fromkeys(tips)) or tip)
-    seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
-    seen, names = proposals.joint_columns(seen, sheet, guess_joints(sheet.numbers, chain.joint_names))
-    seen = proposals.measured(seen, sheet)
+    seen = Source(csv, chain, joints, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), sheet.numbers, tips)
+    seen, names = proposals.joint_columns(seen, guess_joints(sheet.numbers, chain.joint_names))
+    seen = proposals.measured(seen)
     units = list(_units(seen, sheet))
     found = {choice.name: str(choice.value) for choice in units}
-    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    seen = replace(seen, table=table)
+    seen = replace(seen, table=replace(seen.table, length=found["length"], angle=found["angle"]))
     yield Choice("base", base, why)
     leaf = "a leaf below it; the markers are fixed to it or to a link before it"
     several = Choice("tip", list(seen.tips), "leaves after which the columns are named")
@@ -72,7 +71,7 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     yield from units
-    others = proposals.other_units(seen, table.length, table.angle)
+    others = proposals.other_units(seen, seen.table.length, seen.table.angle)
     if others:
         yield Choice("", "", f"{few(others)}: the names say another unit than the robot finds in the numbers: check it")
     if "rotation" not in found:
@@ -111,7 +110,7 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
         named = [entry for entry in found if not proposals.other_units(source, *entry[1][:2])]
         (best, (length, angle, camera)), *others = found = named or found
     if not proposals.is_clear(found, CLEAR_RATIO):
-        poses = list(proposals.camera(source, sheet))
+        poses = list(proposals.rotation(source, camera=True))
         if best == inf and not poses:
             source.read_residual(TableFormat(length, angle, *marks))  # says why
         if not poses:
