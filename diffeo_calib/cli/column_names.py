@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 ROLES = {
     "measured": "actual act measured meas measure measurement msr ist istwert reported encoder enc feedback fb "
-    "observed observation obs gemessen mess messung messwert mesure mesuree misurato misurata medido medida real reale reel "
-    "gemeten zmierzone "
-    "实际 实测 実測 実測値 測定 測定値",
+    "observed observation obs gemessen mess messung messwert mesure mesuree misurato misurata medido medida real "
+    "reale reel gemeten zmierzone 实际 实测 実測 実測値 測定 測定値",
     "wished": "target cmd command commanded goal desired des soll sollwert ziel vorgabe geplant nenn referenz sp ref "
     "setpoint reference nominal nom plan planned wish wished wanted demand demanded ideal action theoretical theo calc "
     "calculated computed fk sim simulated predicted expected consigne cible commande theorique nominale comando "
