@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 ROLES = {
@@ -22,8 +23,7 @@ ROLES = {
     "deviation": "std stddev stdev dev deviation sigma err error uncertainty unc rms var residual",
     "rate": "vel velocity velocities speed qd dq qdot dot acc accel acceleration qdd ddq gyro imu tau torque torques "
     "effort moment force wrench ft current currents voltage volt power temp temperature mode control window momentum "
-    "load pressure status nm "
-    "strom drehmoment geschwindigkeit vitesse couple",
+    "load pressure status nm strom drehmoment geschwindigkeit vitesse couple",
     "turn": "rot rotation euler quat quaternion ang angle angles orientation ori rotvec rpy phi q",
     "place": "t p pos position trans translation point",
     "tool": "tcp pose ee cartesian cart tool marker point",
@@ -110,11 +110,8 @@ def column(name: str) -> Column:
     text = "".join(sign for sign in unicodedata.normalize("NFKD", text) if not unicodedata.combining(sign))
     text = re.sub("(?<![A-Za-z])[a-z][XYZW](?![A-Za-z])", lambda axis: axis[0].lower(), text)  # dX, rX
     words = [part for word in SPLIT.findall(text) for part in _parts(word.lower())]
-    at = [
-        k
-        for k, word in enumerate(words)
-        if word in UNITS and k and (len(word) > 2 or word == "mm" or k + 1 == len(words))
-    ]
+    units = [k for k, word in enumerate(words) if word in UNITS and k]
+    at = [k for k in units if len(words[k]) > 2 or words[k] == "mm" or k + 1 == len(words)]
     unit = UNITS[words.pop(at[-1])] if at else ""
     for place, word in enumerate(words):  # the current position, not the current of a motor
         if word == "current" and {*words[place + 1 :]} & ({*WORDS["joint"], *WORDS["tool"], *"xyz"} - {"a"}):
@@ -133,16 +130,15 @@ def _parts(word: str) -> list[str]:
 
 def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
     """The columns whose names differ by some of these labels alone, in the order of the labels."""
-    found: dict[tuple[tuple[str, ...], tuple[str, ...]], dict[str, str]] = {}
-    wanted = set(labels)
-    for name in names:
-        words = column(name).words
-        for start in range(len(words)):
-            for end in range(start + 1, min(start + LONGEST_LABEL, len(words)) + 1):
-                label = "".join(words[start:end])
-                if label in wanted:
-                    found.setdefault((words[:start], words[end:]), {}).setdefault(label, name)
-    for (before, after), own in found.items():
+    found: dict[tuple[tuple[str, ...], tuple[str, ...], int], dict[str, str]] = {}
+    wanted, seen = set(labels), Counter[tuple[str, ...]]()
+    for words, name in ((column(name).words, name) for name in names):
+        seen[words] += 1  # X and x are columns of two groups
+        for start, end in combinations(range(len(words) + 1), 2):
+            label = "".join(words[start:end]) if end - start <= LONGEST_LABEL else ""
+            if label in wanted:
+                found.setdefault((words[:start], words[end:], seen[words]), {})[label] = name
+    for (before, after, _), own in found.items():
         yield Group(before, after, {label: own[label] for label in labels if label in own})
 
 

@@ -237,7 +237,8 @@ def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> tuple[lis
         following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in ("q0", "q1") else []
         for group in whole(columns, labels):
             longer = any(one[:2] == group[:2] for one in groups(columns, following))  # a series of joints
-            plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & {"r", "m", "t"})
+            marks = {"r", "m", "t"} if labels[0] in ("00", "11") else {"r"}
+            plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & marks)
             if not (longer or plain or group.says("rate", "deviation")):
                 other = (group.shared - group.says("turn", "place")) ^ own
                 found.append((group.wished, len(other), list(group.names.values()), usual))

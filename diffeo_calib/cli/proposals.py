@@ -390,7 +390,8 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. Nothing if there
     are no columns of a rotation; a remark, but for a camera, if no convention is clearly better.
     """
-    others, table = [name for name in source.numbers if name not in source.joints], source.table
+    used, table = {*source.joints, *(name for triple in source.rows.markers for name in triple)}, source.table
+    others = [name for name in source.numbers if name not in used]
     guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
     found = [(source.rows.matrix, "a matrix")] if source.rows.matrix else [one for one in guessed if one is not None]
     if not found:
@@ -407,7 +408,11 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     }
     clear = residuals(source, formats)
     if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
-        what = "rotations of no convention that is clearly better than others" if own_body else "turns of another body"
+        what = (
+            "rotations of no convention that is clearly better than others"
+            if own_body
+            else "rotations, but not one for each marker"
+        )
         usual = " or ".join(dict.fromkeys(words for _, words in found))
         if not camera:
             yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")

@@ -146,6 +146,7 @@ def test_wished_places_are_no_markers(measured: str, wished: str) -> None:
 
 
 def test_two_markers_stay_two() -> None:
+    assert guess_positions([*triple("{}"), *triple("{}", "XYZ")])[0] == [triple("{}"), triple("{}", "XYZ")]
     for names in ("left_{}", "{}1", "target 1 {}", "m{}"):
         both = [triple("b_{}"), triple(names)]
         assert guess_positions([*both[0], *both[1]]) == (both, [])
@@ -213,3 +214,11 @@ def test_poses_as_matrices(names: list[str], named: bool) -> None:
 def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:
     found = column(name)
     assert (found.words, found.unit) == (words, unit)
+
+
+def test_places_are_no_rotations() -> None:
+    assert guess_rotation(triple("m1_{}"), triple("m2_{}")) is None
+    assert guess_rotation(triple("tip_{}"), triple("m2_{}")) is None
+    found = guess_rotation([*triple("a rot {}"), *triple("b rot {}")], triple("b_{}"))
+    assert found is not None
+    assert found[0] == triple("b rot {}")

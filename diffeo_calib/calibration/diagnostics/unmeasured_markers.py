@@ -49,7 +49,7 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         far = max(other for other, tip in zip(own, tips, strict=True) if tip == tips[k])
         if isfinite(far) and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
-            yield Unmeasured(k, words, typical < gates.DIGITS_SHARE * size)
+            yield Unmeasured(k, f"{words}: wished places", typical < gates.DIGITS_SHARE * size)
 
 
 def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:

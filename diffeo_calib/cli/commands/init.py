@@ -108,7 +108,7 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
     (best, (length, angle, camera)), *others = found = proposals.residuals(source, formats)
     if not proposals.is_clear(found, CLEAR_RATIO):
         named = [entry for entry in found if not proposals.other_units(source, *entry[1][:2])]
-        (best, (length, angle, camera)), *others = found = named or found
+        (best, (length, angle, camera)), *others = found = named if found[0] in named else found
     if not proposals.is_clear(found, CLEAR_RATIO):
         poses = list(proposals.rotation(source, camera=True))
         if best == inf and not poses:
