@@ -47,9 +47,9 @@ ROTATIONS = (
     (("phi", "theta", "psi"), "Euler angles"),
 )
 """Labels of the columns of a rotation, and what is usually written with them."""
-ENTRIES = [*(["".join((row, k)) for row in index for k in index] for index in ("0123", "1234"))]
-ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)]
-"""Labels of the 16 numbers of a pose as a matrix: by row and column, or counted."""
+ENTRIES = [[row + k for row in index for k in index] for index in ("0123", "1234")]
+ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:12] for labels in ENTRIES]
+"""Labels of the 16 numbers of a pose as a matrix: by row and column, without the last row too, or counted."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def guess_positions(columns: Sequence[str]) -> tuple[list[list[str]], list[tuple
 
 
 def guess_matrix(columns: Sequence[str]) -> tuple[list[str], bool] | None:
-    """The 16 columns of a pose as a matrix, and whether they are named by row and column; None without any."""
+    """The 16 or 12 columns of a pose as a matrix, and whether they are named by row and column; None without any."""
     for labels in ENTRIES:
         for group in whole(columns, labels):
             if not group.wished and not _goes_on(columns, group):

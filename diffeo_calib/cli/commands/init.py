@@ -106,9 +106,10 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
         )
     }
     (best, (length, angle, camera)), *others = found = proposals.residuals(source, formats)
-    if not proposals.is_clear(found, CLEAR_RATIO):
-        named = [entry for entry in found if not proposals.other_units(source, *entry[1][:2])]
-        (best, (length, angle, camera)), *others = found = named if found[0] in named else found
+    named = [entry for entry in found if not proposals.other_units(source, *entry[1][:2])]
+    open_ones = not proposals.is_clear(found, CLEAR_RATIO) and len(named) < len(found)
+    if open_ones and named and named[0][0] < CLEAR_RATIO * best:
+        (best, (length, angle, camera)), *others = found = named
     if not proposals.is_clear(found, CLEAR_RATIO):
         poses = list(proposals.rotation(source, camera=True))
         if best == inf and not poses:
@@ -121,7 +122,8 @@ def _units(source: Source, sheet: Sheet) -> Iterator[Choice]:
             raise InputError.of(what, expected="one clear reading", got=got, fix=fix)
         yield from poses
         return
-    why = source.words(best, others[0][0]) if others else "by the names of the columns: the numbers leave it open"
+    why = source.words(best, others[0][0] if others else inf)
+    why += ", by the names of the columns: the numbers leave it open" * open_ones
     yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
     yield Choice("angle", angle, why if no_length else "the same")
     if camera:
