@@ -196,7 +196,8 @@ def test_an_axis_without_a_column_is_named() -> None:
 def test_poses_as_matrices(names: list[str], named: bool) -> None:
     wished = [f"{name}_d" for name in names] if "EE" in names[0] else []
     assert guess_matrix([*wished, *names]) == (names, named)
-    assert guess_matrix(names[:-1]) is None
+    assert guess_matrix(names[:-1]) == ((names[:12], True) if named else None), "twelve numbers are a pose too"
+    assert guess_matrix(names[:11]) is None
 
 
 @pytest.mark.parametrize(
