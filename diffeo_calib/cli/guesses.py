@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
 from diffeo_calib.measurements.csv.lines import CsvLines
@@ -17,40 +19,38 @@ SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
 """Rows that are looked at."""
-NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
-"""Parts of the names of columns that hold deviations or wishes, not measured places."""
-TURNS = ("rot", "euler", "quat", "ang")
-"""Parts of the names of columns that hold rotations."""
-UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE)
-"""Units that follow the name of a column."""
-
-
-PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
-"""A letter before x, y, z that says what they are: translation, position, measured."""
-PIXELS = ("u", "v"), ("pixel_u", "pixel_v"), ("u_px", "v_px")
+PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
-SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
-PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
+SESSIONS = ("session", "setup", "station", "anchor", "device", "plane")
+PAYLOADS = ("payload", "mass", "load")
 COVARIATES = {
-    "time": ("time", "time_s", "time_h", "timestamp", "seconds", "minutes", "hours", "hour"),
-    "temperature": ("temperature", "temp", "temperature_c", "temp_c"),
+    "time": ("time", "times", "timeh", "timestamp", "seconds", "minutes", "hours", "hour"),
+    "temperature": ("temperature", "temp", "temperaturec", "tempc"),
 }
 """Option -> names of columns with which something may drift."""
+PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
+"""Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
 ROTATIONS = (
-    ("qx", "qy", "qz", "qw"),
-    ("quat_x", "quat_y", "quat_z", "quat_w"),
-    tuple(f"r{row}{column}" for row in "123" for column in "123"),
-    tuple(f"r{row}{column}" for row in "012" for column in "012"),
-    ("rx", "ry", "rz"),
-    ("rot_x", "rot_y", "rot_z"),
-    ("rotvec_x", "rotvec_y", "rotvec_z"),
-    ("roll", "pitch", "yaw"),
-    ("euler1", "euler2", "euler3"),
+    (("qx", "qy", "qz", "qw"), "a quaternion"),
+    (("x", "y", "z", "w"), "a quaternion"),
+    (("q0", "q1", "q2", "q3"), "a quaternion, usually the real part first (quat_wxyz)"),
+    (("q1", "q2", "q3", "q4"), "a quaternion, usually the real part first (quat_wxyz)"),
+    *((tuple(f"{row}{k}" for row in index for k in index), "a matrix by rows") for index in ("012", "123")),
+    (("rx", "ry", "rz"), "a rotation vector, or angles about x, y and z"),
+    (("x", "y", "z"), "a rotation vector, or angles about x, y and z"),
+    (("roll", "pitch", "yaw"), "angles about fixed x, y and z (xyz)"),
+    (("a", "b", "c"), "angles of KUKA: ZYX in deg"),
+    (("w", "p", "r"), "angles of Fanuc: xyz in deg"),
+    (("euler1", "euler2", "euler3"), "Euler angles"),
+    (("alpha", "beta", "gamma"), "Euler angles"),
+    (("phi", "theta", "psi"), "Euler angles"),
 )
-"""Ends of the names of rotation columns."""
-DEVIATIONS = re.compile(r"(std_?dev|stdev|std|sigma|dev)")
+"""Labels of the columns of a rotation, and what is usually written with them."""
+ENTRIES = [[row + k for row in index for k in index] for index in ("0123", "1234")]
+ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:12] for labels in ENTRIES]
+"""Labels of the 16 numbers of a pose as a matrix: by row and column, without the last row too, or counted."""
 
 
 @dataclass(frozen=True)
@@ -115,41 +115,107 @@ def _odd(name: str, lines: Sequence[int], texts: Sequence[str], decimal: str) ->
     return found if seem or 2 * len(found) < len(texts) else []
 
 
-def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
-    """Columns of the joints in the robot's order, and why; None if no reading of the names gives them all.
+class JointColumns(NamedTuple):
+    """Columns that may be those of the joints, in the robot's order; why; the better, the smaller the rank."""
 
-    Names are compared as they are, without case, units and signs, and then as numbered series such as q1, q2, ...
+    names: list[str]
+    how: str
+    rank: tuple[int, ...]
+
+    @property
+    def shown(self) -> str:
+        """The first and the last."""
+        return f"{self.names[0]} to {self.names[-1]}" + " (commanded)" * bool(self.rank and self.rank[0])
+
+
+def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointColumns]:
+    """Columns that may be those of the joints, the best first: speeds, torques and poses of the tool are none.
+
+    Names are compared without what all have in common before or after, and as numbered series such as q1, q2, ...
+    What encoders reported comes before what nothing is said of, and this before what was commanded.
     """
-    if columns and all(column.isdecimal() for column in columns) and len(columns) > len(joints):
-        return [*columns[: len(joints)]], "the first columns: no line of the file names them"
-    for how, plain in (("named as in the URDF", str), ("named as in the URDF but for units and case", _bare)):
-        known = {plain(column): column for column in columns}
-        if len(known) == len(columns) and all(plain(joint) in known for joint in joints):
-            return [known[plain(joint)] for joint in joints], how
-    series: dict[str, dict[int, str]] = {}
-    for column in columns:
-        parts = re.fullmatch(r"(.*?)(\d+)(\D*)", column)
-        if parts is not None:
-            series.setdefault(f"{parts[1]}#{parts[3]}".lower(), {})[int(parts[2])] = column
-    for numbered in series.values():
-        for first in (0, 1):
-            wanted = range(first, first + len(joints))
-            if len(numbered) == len(joints) and set(numbered) == set(wanted):
-                return [numbered[k] for k in wanted], "numbered in the order of the URDF's joints"
+    if columns and all(name.isdecimal() for name in columns) and len(columns) > len(joints):
+        return [JointColumns([*columns[: len(joints)]], "the first columns: no line of the file names them", ())]
+    if set(joints) <= set(columns):
+        return [JointColumns(list(joints), "named as in the URDF", ())]
+    found: dict[tuple[str, ...], JointColumns] = {}
+    for labels, named, group in _named_after(columns, joints):
+        names, numbered = list(group.names.values()), labels[-1].isdigit()
+        missing = [k for k, label in enumerate(labels) if label not in group.names]
+        rails = [name for name in columns if _is_external(name) and name not in names][: len(missing)]
+        other = numbered and (group.says("tool") or group.shared & {*"xyz"} or _goes_on(columns, group))
+        if other or group.says("rate", "deviation") or len(missing) > 1 or len(rails) < len(missing):
+            continue
+        for k in missing:
+            names.insert(k, rails[0])
+        said = group.says("measured") or group.shared & {"position", "pos", "qpos"}
+        unlike = [k for k in missing if not _is_external(joints[k])]
+        rank = group.wished, bool(numbered and not group.says("joint")), not said, len(missing), len(unlike)
+        why = ", commanded" if group.wished else f", reported: '{min(said)}'" if said else ""
+        why += "".join(f", {rails[0]} for {joints[k]}" for k in missing)
+        found.setdefault(tuple(names), JointColumns(names, named + why, rank))
+    return sorted(found.values(), key=lambda one: one.rank)
+
+
+def joints_without_column(columns: Sequence[str], joints: Sequence[str]) -> list[str]:
+    """The joints that no column is named after, of the naming that most columns follow."""
+    closest = max(_named_after(columns, joints), key=lambda found: len(found[2].names), default=None)
+    if closest is None:
+        return list(joints)
+    return [joint for joint, label in zip(joints, closest[0], strict=True) if label not in closest[2].names]
+
+
+def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tuple[list[str], str, Group]]:
+    """Columns with some of the labels that joints may have, all of these in the robot's order, and what they are."""
+    words, n = [column(joint).words for joint in joints], len(joints)
+    counts = Counter(word for own in words for word in set(own))
+    full = ["".join(own) for own in words]
+    bare = ["".join(word for word in own if counts[word] < n or n == 1) for own in words]
+    alone = [next((word for word in own if counts[word] == 1 and not word.isdigit()), "") for own in words]
+    usual = "named as in the URDF but for units, case and what all have in common"
+    labels = [(usual, full)] + [(usual, own) for own in (bare, alone) if all(own) and not all(map(str.isdigit, own))]
+    labels += [("named as on the robot's pendant", list(names)) for names in PENDANTS if len(names) == n]
+    series = [[f"{k + first:0{width}d}" for k in range(n)] for first in (0, 1) for width in (1, 2)]
+    series += [["", *own[:-1]] for own in series if n > 1]  # the first joint is a rail
+    labels += [("numbered in the order of the URDF's joints", own) for own in series]
+    return ((own, how, group) for how, own in labels for group in groups(columns, own))
+
+
+def _is_external(name: str) -> bool:
+    """Whether a name is that of an axis beside those of the arm, such as E1 or rail."""
+    return bool({*column(name).words} & WORDS["external"])
+
+
+def _goes_on(columns: Sequence[str], group: Group) -> set[str]:
+    """Columns of a numbered series before and after these."""
+    numbers = [int(label) for label in group.names]
+    around = [(*group.before, str(k), *group.after) for k in (min(numbers) - 1, max(numbers) + 1)]
+    return {name for name in columns if column(name).words in around}
+
+
+def guess_positions(columns: Sequence[str]) -> tuple[list[list[str]], list[tuple[list[str], str]]]:
+    """Triples of columns whose names differ by x, y and z alone; and those of no measured places, with the reason."""
+    found = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
+    kept, left = list[list[str]](), list[tuple[list[str], str]]()
+    for group in found:
+        names = list(group.names.values())
+        better = [one for one in found if one.stem == group.stem and one.rank < group.rank]
+        if group.wished:
+            left.append((names, "wished places"))
+        elif better:
+            left.append((names, f"places beside the measured ones of {better[0].names['x']}"))
+        else:
+            kept.append(names)
+    return kept, left
+
+
+def guess_matrix(columns: Sequence[str]) -> tuple[list[str], bool] | None:
+    """The 16 or 12 columns of a pose as a matrix, and whether they are named by row and column; None without any."""
+    for labels in ENTRIES:
+        for group in whole(columns, labels):
+            if not group.wished and not _goes_on(columns, group):
+                return list(group.names.values()), len(labels[0]) == 2
     return None
-
-
-def guess_positions(columns: Sequence[str]) -> list[list[str]]:
-    """Triples of columns whose names differ by x, y and z alone, in their order; no deviations, no targets."""
-    found: dict[str, dict[str, str]] = {}
-    no_place = (*NOT_MEASURED, *TURNS)
-    for column in [name for name in columns if not any(word in name.lower() for word in no_place)]:
-        for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
-            around = column[:place], column[place + 1 :]
-            before, after = PLACE.sub("", around[0]), around[1]
-            if not any(text and text[edge].isalpha() for text, edge in ((before, -1), (after, 0))):
-                found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
-    return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
 
 
 def guess_sockets(header: Sequence[str]) -> list[str] | None:
@@ -160,17 +226,17 @@ def guess_sockets(header: Sequence[str]) -> list[str] | None:
 
 def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     """Texts of `fit --reading` of all kinds of devices, by the names of their columns; these columns."""
-    found = dict[str, list[str]]()
+    found, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
     for kind in known_kinds().values():
         numbers = [""] if kind.numbers_each == 1 else [f"{k + 1}" for k in range(kind.numbers_each)]
-        unit = UNITS if kind.unit == MILLIMETRES else re.compile(rf"[_ ]*[\[(]?{re.escape(kind.unit[0])}[\])]?$")
-        there = {_plain(unit.sub("", name)): name for name in reversed(columns)}
+        units = LENGTHS if kind.unit == MILLIMETRES else {kind.unit[0]}
+        there = {one.plain: one.name for one in described if not one.unit or one.unit in units}
         for word, known in kind.columns().items():
-            each = ([f"{_plain(name)}{number}" for number in numbers] for name in known)
+            each = ([f"{column(name).plain}{number}" for number in numbers] for name in known)
             own = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
             if own is not None and own not in found.values():
                 found[f"{word}={','.join(own)}"] = own
-    names = {name.lower(): name for name in columns}
+    names = {one.plain: one.name for one in described}
     pixels = next(([names[name] for name in pair] for pair in PIXELS if set(pair) <= set(names)), None)
     if pixels is not None:
         found[f"image={','.join(pixels)},{LENS}"] = pixels
@@ -178,47 +244,39 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
 
 
 def guess_column(header: Sequence[str], words: Sequence[str]) -> str | None:
-    """The first column that has one of these names, but for case and units; None without one."""
-    return next((name for name in header if UNITS.sub("", name).lower() in words), None)
+    """The first column that has one of these names, but for case, signs and units; None without one."""
+    return next((name for name in header if column(name).plain in words), None)
 
 
-def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:
-    """Columns of a rotation by their names: four of a quaternion, nine of a matrix or three angles; None without any.
+def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> tuple[list[str], str] | None:
+    """Columns of a rotation by their names, and what such names usually mean; None without any.
 
-    Of several, those whose names begin as the position's do.
+    Four of a quaternion, nine of a matrix or three angles; of several the measured ones, and those whose names have
+    most in common with the position's.
     """
-    names = [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]
-    found: list[tuple[str, list[str]]] = []
-    for words in ROTATIONS:
-        by_prefix: dict[str, dict[str, str]] = {}
-        for name in names:
-            bare = UNITS.sub("", name).lower()
-            word = next((word for word in words if bare.endswith(word)), None)
-            if word is not None:
-                by_prefix.setdefault(bare.removesuffix(word), {})[word] = name
-        found += [
-            (before, [own[word] for word in words]) for before, own in by_prefix.items() if len(own) == len(words)
-        ]
-    start = position[0].lower()
-    return min(found, key=lambda entry: not start.startswith(entry[0]), default=(None, None))[1]
+    own, found = {*column(position[0]).words} - {"x", *WORDS["place"]}, list[tuple[bool, int, list[str], str]]()
+    for labels, usual in ROTATIONS:
+        following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in ("q0", "q1") else []
+        for group in whole(columns, labels):
+            longer = any(one[:2] == group[:2] for one in groups(columns, following))  # a series of joints
+            marks = {"r", "m", "t"} if labels[0] in ("00", "11") else {"r"}
+            plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & marks)
+            if not (longer or plain or group.says("rate", "deviation")):
+                other = (group.shared - group.says("turn", "place")) ^ own
+                found.append((group.wished, len(other), list(group.names.values()), usual))
+    best = min(found, key=lambda entry: entry[:2], default=None)
+    return None if best is None else best[2:]
 
 
 def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
     """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
-    known: dict[str, str] = {}
-    for column in columns:
-        bare = DEVIATIONS.sub("", UNITS.sub("", column).lower())
-        if bare != UNITS.sub("", column).lower():
-            known[re.sub(r"[^a-z0-9]", "", bare)] = column
-    wanted = [_bare(name) for triple in triples for name in triple]
-    return [known[name] for name in wanted] if all(name in known for name in wanted) else None
+    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
+    known = {_without(one, WORDS["deviation"]): one.name for one in deviations}
+    known |= {_without(one, WORDS["deviation"] | WORDS["measured"]): one.name for one in deviations}
+    wanted = [column(name) for triple in triples for name in triple]
+    found = [known.get(one.plain) or known.get(_without(one, WORDS["measured"])) for one in wanted]
+    return None if None in found else [name for name in found if name is not None]
 
 
-def _bare(name: str) -> str:
-    """A name without unit, case and signs."""
-    return _plain(UNITS.sub("", name))
-
-
-def _plain(name: str) -> str:
-    """A name without case and signs."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+def _without(one: Column, words: frozenset[str]) -> str:
+    return "".join(word for word in one.words if word not in words)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -18,18 +17,22 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
+from diffeo_calib.calibration.diagnostics.unmeasured_markers import unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cameras.files import read_camera
+from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     COVARIATES,
     LENS,
     PAYLOADS,
     SESSIONS,
     SOME_LENS,
+    JointColumns,
     Sheet,
     guess_column,
     guess_deviations,
+    guess_matrix,
     guess_positions,
     guess_readings,
     guess_rotation,
@@ -64,6 +67,8 @@ FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
+BELOW = (12, 13, 14)
+"""Places of the zeros below a rotation, of a matrix by rows."""
 LARGEST_RESIDUAL = 0.1
 """Median residual, as a share of the spread, above which no reading is right."""
 SMALLEST_SPREAD_M = 1e-9
@@ -95,6 +100,7 @@ class RowColumns:
     Args:
         markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
             or its set-up. payload: of the mass carried. covariates: option, time or temperature -> column.
+        matrix: the nine of the rotation, by rows, where poses are written as matrices. left: what is not used, and why.
     """
 
     markers: list[list[str]]
@@ -103,6 +109,8 @@ class RowColumns:
     session: str | None
     payload: str | None
     covariates: dict[str, str] = field(default_factory=dict)
+    matrix: Sequence[str] = ()
+    left: Sequence[str] = ()
 
     @property
     def without_length(self) -> bool:
@@ -119,6 +127,7 @@ class RowColumns:
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
             yield Choice("position", names, f"{len(names)} marker(s), by their names")
+        yield from (Choice("", "", f"{text}; not used") for text in self.left)
         if self.sockets:
             yield Choice(
                 "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
@@ -137,20 +146,20 @@ class RowColumns:
             yield Choice("session", self.session, why)
         if self.payload is not None:
             yield Choice("payload", self.payload, "by its name: the known mass that the robot carried")
-        for option, column in self.covariates.items():
-            yield Choice(
-                option, column, "by its name: a drift with it is sought, and kept where left-out rows prove it"
-            )
+        for option, name in self.covariates.items():
+            yield Choice(option, name, "by its name: a drift with it is sought, and kept where left-out rows prove it")
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""
     sockets = guess_sockets(sheet.header) or []
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
+    markers, unmeasured = guess_positions([name for name in with_gaps if name not in joints])
+    left = [f"{few(names)}: {why}" for names, why in unmeasured]
     others = [name for name in sheet.numbers if name not in joints]
-    if all(name.isdecimal() for name in sheet.header) and len(others) > 2:
-        markers = [others[:3]]  # no line names them
+    nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
+    matrix = () if markers or nameless else _matrix_in(csv, sheet, others)
+    markers = [others[:3]] if nameless else markers or [list(own) for own in matrix[:1]]
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
@@ -158,12 +167,28 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
         fix = f"if they are in another file: --places FILE --by {common}; "
         fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
+        got = "; ".join(left) or few(sheet.numbers, 20)
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
     named = [name for name in sheet.header if name not in joints]
     session = None if sockets and not readings else guess_column(named, SESSIONS)
     guessed = {option: guess_column(others, words) for option, words in COVARIATES.items()}
-    drifting = {option: column for option, column in guessed.items() if column is not None}
-    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting)
+    drifting = {option: name for option, name in guessed.items() if name is not None}
+    nine = [name for own in matrix[1:] for name in own]
+    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting, nine, left)
+
+
+def _matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
+    """Position and rotation, by rows, of poses that are written as 16 numbers by rows or columns; none without them."""
+    found = guess_matrix(columns)
+    if found is None:
+        return ()
+    names, named = found
+    header, rows = read_cells(csv, sheet.sep)
+    by_rows = named or all(
+        number(cells[header.index(names[k])], sheet.decimal) == 0 for _, cells in rows for k in BELOW
+    )
+    entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
+    return [row[3] for row in entries], [name for row in entries for name in row[:3]]
 
 
 def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
@@ -203,8 +228,8 @@ def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]]
 
 def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
     """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
-    known = {leaf.lower(): leaf for leaf in leaves}
-    found = [known.get(re.sub(r"[_\-. ]?[xX]$", "", triple[0]).lower()) for triple in markers]
+    known = {column(leaf).plain: leaf for leaf in leaves}
+    found = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in markers]
     tips = [tip for tip in found if tip is not None]
     return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
@@ -387,6 +412,50 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
+def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source, list[Choice]]:
+    """The columns of the joints, and why: of those that names do not tell apart those that the nominal robot explains.
+
+    Where it does not tell them apart either, a remark for each asks the user.
+    """
+    best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
+    for length in ("m", "mm") if len(equal) > 1 else ():
+        tables = {angle: replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")}
+        tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
+        (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
+        clear.append((second / least if 0 < least < inf else 1.0, own))
+    ratio, taken = max(clear, key=lambda entry: entry[0])
+    if len(equal) > 1 and ratio < gates.READINGS_TOLD_APART:
+        why = "uncomment the right line"
+        lines = [Choice("joints", ",".join(one.names), f"{why}: {one.how}", sure=False) for one in equal]
+        return replace(source, joints=best.names), lines
+    why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
+    why += "".join(f"; not {one.shown}" for one in found[:4] if one is not taken)
+    return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
+
+
+def measured(source: Source) -> Source:
+    """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
+    found, several = dict[int, str](), len(source.rows.markers) > 1
+    for length, angle in product(("m", "mm"), ("rad", "deg")) if several else ():
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            positions = measured_positions(source.read(replace(source.table, length=length, angle=angle)))
+            every = [] if positions is None else unmeasured_markers(source.robot, positions.largest_session())
+            found = found or {marker: words for marker, words, _ in every}
+    rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
+    left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
+    rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
+    return replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
+
+
+def other_units(source: Source, table: TableFormat) -> list[str]:
+    """Columns of joints and positions whose names say other units."""
+    turning = [name for name, turns in zip(source.joints, source.robot.periodic, strict=True) if turns]
+    places = [name for triple in source.rows.markers for name in triple]
+    pairs = *product(turning, (table.angle,)), *product(places, (table.length,))
+    return [name for name, unit in pairs if column(name).unit not in ("", unit)]
+
+
 def residuals(source: Source, formats: Mapping[Any, TableFormat]) -> list[tuple[float, Any]]:
     """Median residual of the nominal robot in every format, and its key; the smallest first."""
     return sorted(((source.residual(table), key) for key, table in formats.items()), key=lambda found: found[0])
@@ -398,76 +467,54 @@ def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
     return best < LARGEST_RESIDUAL and all(value >= ratio * best for value, _ in others)
 
 
-def _clear_rotation(source: Source, formats: Mapping[Any, TableFormat], other: str) -> tuple[Any, str] | None:
-    """The format, by its key, that explains poses clearly better than all others, which ``other`` names; and why."""
-    (best, key), *others = found = residuals(source, formats)
-    if not is_clear(found, gates.READINGS_TOLD_APART):
-        return None
-    than = f", {other} at least {100 * others[0][0]:.3g} %" if others and others[0][0] < inf else ""
-    return key, f"the nominal robot leaves, of what the rows vary, {100 * best:.2g} %{than}"
+def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
+    """A rotation: the convention with which the nominal robot explains the poses clearly better than with all others.
 
-
-def _readings_of(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Conventions and units in which so many columns can hold a rotation."""
-    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
-    return product(conventions, ("deg", "rad") if len(names) == 3 else (None,))
-
-
-def rotation(source: Source) -> Iterator[Choice]:
-    """A rotation: the convention with which the nominal robot explains the poses best.
-
-    Nothing if there are no such columns, or no convention is clearly better than all others; then a remark says so.
+    With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. Nothing if there
+    are no columns of a rotation; a remark, but for a camera, if no convention is clearly better.
     """
-    guessed = [guess_rotation(source.numbers, marker) for marker in source.rows.markers]
-    each = [names for names in guessed if names is not None and not set(names) & set(source.joints)]
-    alone = len(source.rows.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
-    if not each or len(each) < len(guessed) or not alone or len(guessed) != max(len(source.tips), 1):
+    used, table = {*source.joints, *(name for triple in source.rows.markers for name in triple)}, source.table
+    others = [name for name in source.numbers if name not in used]
+    guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
+    found = [(source.rows.matrix, "a matrix")] if source.rows.matrix else [one for one in guessed if one is not None]
+    if not found:
         return
-    names = [name for own in each for name in own]
-    columns = each[0] if len(each) == 1 else each
+    each, names = [list(own) for own, _ in found], list(dict.fromkeys(name for own, _ in found for name in own))
+    own_body = len(source.rows.markers) == max(len(source.tips), 1) == len(each) and len(names) == sum(map(len, each))
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])] if own_body else []
+    turns = product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,))
+    units = product(UNITS_PER_METRE, ("rad", "deg")) if camera else [(table.length, table.angle)]
+    known = replace(table, rotation=each[0] if len(each) == 1 else each, camera_on_tool=camera)
     formats = {
-        (name, unit): replace(source.table, rotation=columns, convention=name, rotation_angle=unit)
-        for name, unit in _readings_of(each[0])
+        (*unit, *turn): replace(known, length=unit[0], angle=unit[1], convention=turn[0], rotation_angle=turn[1])
+        for unit, turn in product(units, turns)
     }
-    found = _clear_rotation(source, formats, "with any other convention or unit")
-    if found is None:
-        yield Choice("", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used")
+    clear = residuals(source, formats)
+    if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
+        what = (
+            "rotations of no convention that is clearly better than others"
+            if own_body
+            else "rotations, but not one for each marker"
+        )
+        usual = " or ".join(dict.fromkeys(words for _, words in found))
+        if not camera:
+            yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
         return
-    (convention, unit), reason = found
+    (best, (length, angle, convention, unit)), *worse = clear
+    why = f"the nominal robot leaves, of what the rows vary, {100 * best:.2g} %"
+    why += f", read in any other way at least {100 * worse[0][0]:.3g} %" if worse and worse[0][0] < inf else ""
     written = [",".join(own) for own in each]
-    why = "by their names; without these three lines positions alone are calibrated"
-    yield Choice("rotation", written[0] if len(written) == 1 else written, why)
-    yield Choice("convention", convention, reason)
+    if camera:
+        yield Choice("length", length, why)
+        yield Choice("angle", angle, "the same")
+        yield Choice(
+            "camera-on-tool", True, "the nominal robot explains poses of a fixed board alone, seen from the tool"
+        )
+    without = "without these three lines positions alone are calibrated"
+    yield Choice("rotation", written[0] if len(written) == 1 else written, f"by their names; {without}")
+    yield Choice("convention", convention, why)
     if unit is not None:
         yield Choice("rotation-angle", unit, "the same")
-
-
-def camera(source: Source) -> Iterator[Choice]:
-    """Units and rotations that make the rows poses of a board seen by a camera on the tool.
-
-    Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
-    """
-    names = guess_rotation(source.numbers, source.rows.markers[0]) if len(source.rows.markers) == 1 else None
-    if names is None or set(names) & set(source.joints):
-        return
-    known = replace(source.table, rotation=names, camera_on_tool=True)
-    formats = {
-        (length, angle, *turn): replace(known, length=length, angle=angle, convention=turn[0], rotation_angle=turn[1])
-        for length, angle, turn in product(UNITS_PER_METRE, ("rad", "deg"), list(_readings_of(names)))
-    }
-    found = _clear_rotation(source, formats, "read in any other way")
-    if found is None:
-        return
-    (length, angle, convention, unit), reason = found
-    yield Choice("length", length, reason)
-    yield Choice("angle", angle, "the same")
-    yield Choice(
-        "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
-    )
-    yield Choice("convention", convention, "the same")
-    if unit is not None:
-        yield Choice("rotation-angle", unit, "the same")
-    yield Choice("camera-on-tool", True, "the nominal robot explains the inverse poses alone")
 
 
 def deviations(source: Source) -> Iterator[Choice]:

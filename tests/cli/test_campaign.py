@@ -200,23 +200,20 @@ def test_other_devices_are_named_where_there_is_no_position(tmp_path: Path, comm
 
 def test_names_of_joints() -> None:
     joints = ["shoulder_pan_joint", "elbow_joint"]
-    assert guess_joints(["t", "elbow_joint", "shoulder_pan_joint"], joints) == (
-        ["shoulder_pan_joint", "elbow_joint"],
-        "named as in the URDF",
-    )
-    found = guess_joints(["Elbow Joint [deg]", "Shoulder pan joint [deg]", "x"], joints)
-    assert found is not None
-    assert found[0] == ["Shoulder pan joint [deg]", "Elbow Joint [deg]"]
-    assert (guess_joints(["q2_rad", "q1_rad", "x"], joints) or [None])[0] == ["q1_rad", "q2_rad"]
-    assert (guess_joints(["A0", "A1", "x"], joints) or [None])[0] == ["A0", "A1"]
-    assert guess_joints(["q1", "q3", "x"], joints) is None
-    assert guess_joints(["q1", "q2", "q3"], joints) is None
+    (found,) = guess_joints(["t", "elbow_joint", "shoulder_pan_joint"], joints)
+    assert found[:2] == (joints, "named as in the URDF")
+    (found, *_) = guess_joints(["Elbow Joint [deg]", "Shoulder pan joint [deg]", "x"], joints)
+    assert found.names == ["Shoulder pan joint [deg]", "Elbow Joint [deg]"]
+    assert guess_joints(["q2_rad", "q1_rad", "x"], joints)[0].names == ["q1_rad", "q2_rad"]
+    assert guess_joints(["A0", "A1", "x"], joints)[0].names == ["A0", "A1"]
+    assert not guess_joints(["q1", "q3", "x"], joints)
+    assert not guess_joints(["q1", "q2", "q3"], joints)
 
 
 def test_names_of_positions() -> None:
     header = ["Goal x", "Goal y", "Goal z", "m_x", "m_std_x", "m_y", "m_std_y", "m_z", "m_std_z", "rx", "ry", "rz"]
-    assert guess_positions(header) == [["m_x", "m_y", "m_z"]]
-    assert guess_positions(["X", "Y", "Z", "x2", "y2", "z2"]) == [["X", "Y", "Z"], ["x2", "y2", "z2"]]
+    assert guess_positions(header) == ([["m_x", "m_y", "m_z"]], [(header[:3], "wished places")])
+    assert guess_positions(["X", "Y", "Z", "x2", "y2", "z2"]) == ([["X", "Y", "Z"], ["x2", "y2", "z2"]], [])
 
 
 def test_the_ur10(tmp_path: Path, command: Command) -> None:
@@ -287,6 +284,7 @@ def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: 
     text = (tmp_path / "c.toml").read_text()
     assert "rotation =" not in text
     assert "# rx, ry, rz: rotations of no convention that is clearly better than others; not used" in text
+    assert "such names usually mean a rotation vector, or angles about x, y and z" in text
 
 
 def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, command: Command) -> None:
@@ -305,10 +303,10 @@ def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, command: Co
 
 def test_names_of_rotations_and_deviations() -> None:
     header = ["Goal roll", "Goal pitch", "Goal yaw", "a_rx", "a_ry", "a_rz", "b_rx [deg]", "b_ry [deg]", "b_rz [deg]"]
-    assert guess_rotation(header, ["b_x"]) == ["b_rx [deg]", "b_ry [deg]", "b_rz [deg]"]
-    assert guess_rotation(header, ["a_x"]) == ["a_rx", "a_ry", "a_rz"]
+    found = [guess_rotation(header, [name]) for name in ("a_x", "b_x")]
+    assert [one[0] for one in found if one] == [header[3:6], header[6:]]
     assert guess_rotation(["x", "y", "z", "rx", "ry"], ["x"]) is None
-    assert guess_positions(["rot_x", "rot_y", "rot_z", "x", "y", "z"]) == [["x", "y", "z"]]
+    assert guess_positions(["rot_x", "rot_y", "rot_z", "x", "y", "z"])[0] == [["x", "y", "z"]]
     triples = [["m_x", "m_y", "m_z"]]
     assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
     assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None
@@ -384,7 +382,7 @@ def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Comma
 @pytest.mark.parametrize("before", ["t", "", "pos_", "meas."])
 def test_positions_by_usual_names(before: str) -> None:
     names = [f"{before}{axis}" for axis in "xyz"]
-    assert guess_positions([*names, "rx", "ry", "rz", "q1"]) == [names]
+    assert guess_positions([*names, "rx", "ry", "rz", "q1"])[0] == [names]
 
 
 def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command) -> None:

@@ -131,6 +131,9 @@ EXACT_SHARE, NOMINAL_SHARE, NOMINAL_RATIO = 1e-6, 1e-4, 1.15
 show; and in that of the geometric calibration, up to which errors of links explain nothing."""
 NOMINAL_OVERDETERMINED, NOMINAL_JOINTS = 3.0, 3
 """Coordinates per unknown from which residuals tell something; joints of robots whose errors places do not absorb."""
+FOLLOWED, DIGITS_SHARE = 0.1, 1e-5
+"""Residual of a marker, in that of another one on the same link, and in the spread of the values, below which it is a
+computed place: digits of files leave as much, devices and robots more."""
 LARGE_PER_REACH, LARGE_PER_USUAL, MOST_LARGE = 0.01, 20.0, 0.25
 """Errors above this share of the robot's reach, and this multiple of those of usual rows after a geometric calibration,
 are no errors of a calibrated robot; share of the rows from which they fail a fit."""

@@ -15,6 +15,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     refuse_or_warn,
 )
 from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
+from diffeo_calib.calibration.diagnostics.unmeasured_markers import check_markers
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     can_register,
@@ -98,8 +99,10 @@ def registered(robot: Tree, data: Measurements) -> Identification:
     """Base and markers from the inliers.
 
     Raises:
-        MeasurementError: points that never move, or rows that another reading explains far better.
+        MeasurementError: points that never move, copied or computed ones, or rows that another reading explains far
+            better.
     """
+    check_markers(robot, data)
     registration, inliers = register_inliers(robot, data)
     _check_motion(robot, data)
     check_row_order(robot, data, registration)

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_R
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import Sheet, guess_joints, guess_sheet
+from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Choice, Source
@@ -95,7 +95,7 @@ def run(given: InitOptions) -> None:
 def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
     folder, urdf = output.parent, is_urdf(robot)
     yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
-    arm, why, seen, units = _explained(csv, robot, sheet)
+    arm, why, seen, names, units = _explained(csv, robot, sheet)
     if urdf:
         yield Choice("base", arm.links.base or "", "root of the URDF")
     if arm.links.dh_convention is not None:
@@ -104,15 +104,17 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
         yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
     elif arm.links.tip is not None:
         yield Choice("tip", arm.links.tip[0], why)
-    meant = [choice for choice in units if choice.name == "joints"]
-    yield from meant or [Choice("joints", ",".join(seen.joints), arm.how)]
+    yield from names
     for choice in seen.rows.entries():
         yield choice._replace(value=_from_folder(choice.value, folder))
     if seen.marker is not None:
         yield seen.marker
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    yield from (choice for choice in units if choice not in meant)
+    yield from units
+    others = proposals.other_units(seen, _format(units, seen))
+    if others:
+        yield Choice("", "", f"{few(others)}: the names say another unit than the robot finds in the numbers: check it")
     if not any(choice.name == "rotation" for choice in units):
         yield from proposals.beside(replace(seen, table=_format(units, seen)), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
@@ -135,11 +137,12 @@ def _format(units: list[Choice], seen: Source) -> TableFormat:
 
 
 class Explained(NamedTuple):
-    """Rows that a robot explains: its joints and why the tip is behind these, the table, and its units."""
+    """Rows that a robot explains: its joints and why the tip is behind these, the table, its columns, and its units."""
 
     arm: Arm
     why: str
     seen: Source
+    names: list[Choice]
     units: list[Choice]
 
 
@@ -154,15 +157,17 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 rows = proposals.rows_in(csv, sheet, arm.columns)
                 tips = proposals.tips_of(rows.markers, leaves)
                 chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
-                joints = guess_joints(sheet.numbers, chain.joint_names) if tips else None
-                columns = arm.columns if joints is None else joints[0]
                 table = TableFormat("mm", "deg", sheet.sep, sheet.decimal)
-                seen = Source(csv, chain, columns, rows, table, sheet.numbers, tips)
+                seen = Source(csv, chain, arm.columns, rows, table, sheet.numbers, tips)
+                guessed = guess_joints(sheet.numbers, chain.joint_names) or [JointColumns(arm.columns, arm.how, ())]
+                seen, names = proposals.joint_columns(seen, guessed)
+                seen = proposals.measured(seen)
                 seen = replace(seen, marker=proposals.marker(seen, sheet))
                 units = list(_units(seen))
-                meant = [str(choice.value) for choice in units if choice.name == "joints"]
-                seen = replace(seen, joints=meant[0].split(",") if len(meant) == 1 else columns)
-                one = _with_tip(robot, Explained(arm, "", seen, units))
+                names = [choice for choice in units if choice.name == "joints"] or names
+                seen = replace(seen, joints=str(names[0].value).split(",")) if names[0].sure else seen
+                units = [choice for choice in units if choice.name != "joints"]
+                one = _with_tip(robot, Explained(arm, "", seen, names, units))
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
             refused.append(error)
@@ -198,22 +203,25 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     for options, joints, ends in whole:
         for count in range(len(joints), 0, -1):
             guessed = guess_joints(sheet.numbers, joints[:count])
-            series = guessed is not None and guessed[1].startswith("numbered")
-            if guessed is not None and (2 * count > len(joints) or not series):  # a short series may be of anything
-                arm = Arm(options, joints[:count], ends, guessed[0], guessed[1])
+            series = bool(guessed) and guessed[0].how.startswith("numbered")
+            if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
+                arm = Arm(options, joints[:count], ends, guessed[0].names, guessed[0].how)
                 arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
                 break
     if not arms:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
         expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
-        raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20))
+        missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
+        fix = f"no column is named after {missing}: name the columns as the joints, or q1, q2, ... in their order"
+        got = few(sheet.numbers, 20)
+        raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=got, fix=fix)
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
 
 def _with_tip(robot: Path, found: Explained) -> Explained:
     """The same without joints at the end that no marker follows, and why."""
-    arm, _, seen, units = found
+    arm, _, seen, names, units = found
     table, left_out = _format(units, seen), list[str]()
     q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
     moved = (q.amax(0) - q.amin(0)).tolist()
@@ -232,7 +240,8 @@ def _with_tip(robot: Path, found: Explained) -> Explained:
             left_out.append(f"{words} {seen.size(residual)}")
         arm, seen = shorter, without
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
-    return Explained(arm, why, seen, list(_units(seen)) if left_out else units)
+    names = [names[0]._replace(value=",".join(seen.joints))] if names[0].sure else names
+    return Explained(arm, why, seen, names, list(_units(seen)) if left_out else units)
 
 
 def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
@@ -256,8 +265,16 @@ def _units(source: Source) -> Iterator[Choice]:
         others = _left(source, lengths, lengths, boards=boards)
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
     (best, (length, angle, slides, camera)), *others = found
+    named = [
+        entry
+        for entry in found
+        if not proposals.other_units(source, replace(source.table, length=entry[1][0], angle=entry[1][1]))
+    ]
+    by_names = not proposals.is_clear(found, CLEAR_RATIO) and 0 < len(named) < len(found)
+    if by_names := by_names and named[0][0] < CLEAR_RATIO * best:
+        (best, (length, angle, slides, camera)), *others = found = named
     clear = proposals.is_clear(found, CLEAR_RATIO)
-    poses = [] if clear else list(proposals.camera(source))
+    poses = [] if clear else list(proposals.rotation(source, camera=True))
     if best == inf and not poses:
         source.read_residual(replace(source.table, length=length, angle=angle))  # says why
     likely = list(dict.fromkeys(key[0] for _, key in found))[:2]
@@ -276,7 +293,8 @@ def _units(source: Source) -> Iterator[Choice]:
     if poses or meant:
         yield from poses or meant
         return
-    why = source.words(best, others[0][0])
+    why = source.words(best, others[0][0] if others else inf)
+    why += ", by the names of the columns: the numbers leave it open" * by_names
     yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
     yield Choice("angle", angle, why if no_length else "the same")
     if slides:
