@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from diffeo_calib.cli.options import Places, Rows, StoredUnits, Units
 from diffeo_calib.cli.proposals import with_places
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
-from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -23,9 +23,9 @@ from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Choice, Source
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
@@ -178,7 +178,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, one.seen)))
     alike = {key: one.seen.residual(_format(best.units, best.seen)) for key, one in found.items()}
     if not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
-        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {best.seen.size(size)}" for key, size in alike.items())
+        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {100 * size:.3g} %" for key, size in alike.items())
         fix = "say the convention in the file, by a line such as `# craig`" if best.arm.links.dh_convention else ""
         fix = fix or "name the columns after the joints of the arm"
         raise InputError.of(
@@ -236,8 +236,8 @@ def _with_tip(robot: Path, found: Explained) -> Explained:
             size, residual = seen.residual(table), without.residual(table)
             if size > proposals.LARGEST_RESIDUAL or residual > size * (1 / CLEAR_RATIO if an_arm_s else NOT_RAISED):
                 break
-            words = f"with {last} the residual of the nominal robot is {seen.size(size)}, without it"
-            left_out.append(f"{words} {seen.size(residual)}")
+            words = f"with {last} the nominal robot leaves {100 * size:.3g} % of what the rows vary"
+            left_out.append(f"{words}, without it {100 * residual:.3g} %")
         arm, seen = shorter, without
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
     names = [names[0]._replace(value=",".join(seen.joints))] if names[0].sure else names

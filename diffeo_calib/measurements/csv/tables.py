@@ -157,7 +157,7 @@ class TableFile(CsvLines):
 
         One such row may be the origin of the frame: then all others must be farther from it than from one another.
         """
-        points, q = numbers[:, own.values[:3]], numbers[:, : len(self.columns.joints)]
+        points, q = numbers[:, own.values[:3]], numbers[:, : len(self.columns.joints.columns)]
         lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)][:FEW_ROWS]
         if not bool(lost.any()) or len(seen) < 2:
             return
@@ -224,7 +224,7 @@ class TableFile(CsvLines):
         for own, here in zip(hideable, seen, strict=True):
             excused[:, own.deviations] &= ~here[:, None]
         if hideable and not self.columns.all_hidden:
-            excused[:, len(self.columns.joints) :] |= ~shows[:, None]  # the row is left out
+            excused[:, len(self.columns.joints.columns) :] |= ~shows[:, None]  # the row is left out
         gaps = empty | large
         wrong: list[tuple[int, int]] = (gaps & ~excused).nonzero().tolist()
         if wrong:
@@ -242,12 +242,13 @@ class TableFile(CsvLines):
     def _check_units(self) -> None:
         """Raise MeasurementError where the file states another unit of a wanted column than it is read with."""
         columns, table = self.columns, self.columns.table
-        slides = zip(columns.joints, columns.prismatic.tolist(), strict=True)
-        read: dict[str, Any] = {name: table.joint_unit if slide else table.angle for name, slide in slides}
+        joints = zip(columns.joints.texts, columns.prismatic.tolist(), columns.joints.plain.tolist(), strict=True)
+        units = [(name, table.joint_unit if slide else table.angle) for name, slide, plain in joints if plain]
+        read: dict[str, Any] = dict(units)
         read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
         stated = {name: stated_unit(name, self.units) for name in read}
         if not columns.kinds_known:  # the joints may be prismatic
-            stated |= {name: None for name in columns.joints if stated[name] not in ANGLES}
+            stated |= {name: None for name, _ in units if stated[name] not in ANGLES}
         wrong = [name for name, unit in read.items() if isinstance(unit, str) and stated[name] not in (None, unit)]
         for name in sorted(wrong, key=lambda name: stated[name] in (*UNITS_PER_METRE, *ANGLE_UNITS)):  # cm, inch first
             what, fix = f"file '{self.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
