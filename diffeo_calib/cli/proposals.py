@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from math import inf
-from os.path import relpath
+from math import inf, log
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,34 +18,22 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.unmeasured_markers import unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
-    COVARIATES,
     LENS,
-    PAYLOADS,
-    SESSIONS,
     SOME_LENS,
     JointColumns,
     Sheet,
-    guess_column,
     guess_deviations,
-    guess_matrix,
-    guess_positions,
-    guess_readings,
     guess_rotation,
-    guess_sheet,
-    guess_sockets,
 )
-from diffeo_calib.cli.options import CORNERS, Places, Rows
+from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.row_columns import Choice, RowColumns
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.common.errors import DiffeoCalibError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
-from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
-from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
@@ -59,179 +45,21 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
 
-USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-"""Widths and heights of images, pixels."""
 BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
 """Of the ball on the tool by images, m."""
 FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 """Those of rotations that are tried."""
-BELOW = (12, 13, 14)
-"""Places of the zeros below a rotation, of a matrix by rows."""
 LARGEST_RESIDUAL = 0.1
 """Median residual, as a share of the spread, above which no reading is right."""
+UNITS = (*UNITS_PER_METRE,), ("rad", "deg")
+MOST_LENGTHS = 2
+"""Units of length, by the size of the robot, with which meanings of the joints are sought."""
 SMALLEST_SPREAD_M = 1e-9
 """Of points that never move."""
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
-
-
-class Choice(NamedTuple):
-    """One entry of the campaign file: an option, its value, and why; a remark if the option is empty."""
-
-    name: str
-    value: str | list[str] | bool
-    why: str
-    sure: bool = True
-
-    def line(self) -> str:
-        """As TOML; as a comment where the user is to decide."""
-        values = self.value if isinstance(self.value, list) else [self.value]
-        written = [json.dumps(value, ensure_ascii=False) for value in values]
-        text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
-        return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
-
-
-@dataclass(frozen=True)
-class RowColumns:
-    """Columns of what was measured, by their names.
-
-    Args:
-        markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
-            or its set-up. payload: of the mass carried. covariates: option, time or temperature -> column.
-        matrix: the nine of the rotation, by rows, where poses are written as matrices. left: what is not used, and why.
-    """
-
-    markers: list[list[str]]
-    sockets: list[str]
-    readings: list[str]
-    session: str | None
-    payload: str | None
-    covariates: dict[str, str] = field(default_factory=dict)
-    matrix: Sequence[str] = ()
-    left: Sequence[str] = ()
-
-    @property
-    def without_length(self) -> bool:
-        """Whether no column is a length."""
-        return not self.markers and all(text.endswith(LENS) for text in self.readings)
-
-    @property
-    def of_boards(self) -> bool:
-        """Whether the rows are corners of a board in images."""
-        return any(text.startswith(CORNERS) for text in self.readings)
-
-    def entries(self) -> Iterator[Choice]:
-        """Those that name them."""
-        if self.markers:
-            names = [",".join(triple) for triple in self.markers]
-            yield Choice("position", names, f"{len(names)} marker(s), by their names")
-        yield from (Choice("", "", f"{text}; not used") for text in self.left)
-        if self.sockets:
-            yield Choice(
-                "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
-            )
-        if self.readings:
-            why = "by names; `displacement` is a distance with an unknown zero"
-            if any(text.endswith(LENS) for text in self.readings):
-                why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
-            sizes = self.of_boards and not self.readings[0].endswith(".yaml")
-            why += "; the lens is that of the file beside the table" * (self.of_boards and not sizes)
-            why += "; width and height of the images are the least usual size that holds all corners" * sizes
-            yield Choice("reading", self.readings[0] if len(self.readings) == 1 else self.readings, why)
-        if self.session is not None:
-            why = "by its name: the device, or its set-up, of every row"
-            why += "; add `remounted = true` if it stayed and the markers were mounted anew" * bool(self.markers)
-            yield Choice("session", self.session, why)
-        if self.payload is not None:
-            yield Choice("payload", self.payload, "by its name: the known mass that the robot carried")
-        for option, name in self.covariates.items():
-            yield Choice(option, name, "by its name: a drift with it is sought, and kept where left-out rows prove it")
-
-
-def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
-    """The probable contents of a table beside its joints."""
-    sockets = guess_sockets(sheet.header) or []
-    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers, unmeasured = guess_positions([name for name in with_gaps if name not in joints])
-    left = [f"{few(names)}: {why}" for names, why in unmeasured]
-    others = [name for name in sheet.numbers if name not in joints]
-    nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
-    matrix = () if markers or nameless else _matrix_in(csv, sheet, others)
-    markers = [others[:3]] if nameless else markers or [list(own) for own in matrix[:1]]
-    readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
-    if not markers and not sockets and not readings:
-        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        common = next((name for name in sheet.header if name not in joints), "COLUMN")
-        fix = f"if they are in another file: --places FILE --by {common}; "
-        fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
-        fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
-        got = "; ".join(left) or few(sheet.numbers, 20)
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
-    named = [name for name in sheet.header if name not in joints]
-    session = None if sockets and not readings else guess_column(named, SESSIONS)
-    guessed = {option: guess_column(others, words) for option, words in COVARIATES.items()}
-    drifting = {option: name for option, name in guessed.items() if name is not None}
-    nine = [name for own in matrix[1:] for name in own]
-    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting, nine, left)
-
-
-def _matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
-    """Position and rotation, by rows, of poses that are written as 16 numbers by rows or columns; none without them."""
-    found = guess_matrix(columns)
-    if found is None:
-        return ()
-    names, named = found
-    header, rows = read_cells(csv, sheet.sep)
-    by_rows = named or all(
-        number(cells[header.index(names[k])], sheet.decimal) == 0 for _, cells in rows for k in BELOW
-    )
-    entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
-    return [row[3] for row in entries], [name for row in entries for name in row[:3]]
-
-
-def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
-    """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
-    header, rows = read_cells(csv, sheet.sep)
-    corners = _corners_in(csv, sheet) if {IMAGE, *POINT, *PIXEL} <= set(header) else []
-    found = guess_readings([name for name in columns if not corners or name not in (*POINT, *PIXEL)])
-    if alone and len(found) == 1 and not corners:
-        return list(found)
-    empty = {name for k, name in enumerate(header) if any(not cells[k].strip() for _, cells in rows)}
-    return [*corners, *(text for text, own in found.items() if set(own) <= empty)]
-
-
-def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
-    """The files of the cameras beside the table, such as `images` has written, else the size of the images."""
-    header, rows = read_cells(csv, sheet.sep)
-    names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
-    files = [f"{name}.yaml" for name in names if name]
-    if len(files) > 1 and all((csv.parent / file).is_file() for file in files):
-        return [f"{CORNERS}{csv.parent / file}" for file in files]
-    own, cameras = csv.with_suffix(".yaml"), list[Path]()
-    for file in [own] if own.is_file() else csv.parent.glob("*.yaml"):
-        with suppress(InputError):  # no camera
-            read_camera(file)
-            cameras.append(file)
-    if len(files) < 2 and len(cameras) == 1:
-        return [f"{CORNERS}{cameras[0]}"]
-    return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
-
-
-def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> tuple[int, int]:
-    """The least usual size of images that hold all corners, pixels."""
-    places = [header.index(name) for name in PIXEL]
-    width, height = (max(number(cells[k], decimal) or 0.0 for _, cells in rows) for k in places)
-    return next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
-
-
-def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
-    """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
-    known = {column(leaf).plain: leaf for leaf in leaves}
-    found = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in markers]
-    tips = [tip for tip in found if tip is not None]
-    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
 
 def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
@@ -242,24 +70,6 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
     if source.rows.markers:
         yield from rotation(source)
         yield from deviations(source)
-
-
-def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
-    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
-    if given.places is None:
-        return csv, []
-    joints, places = sheets = guess_sheet(csv), guess_sheet(given.places)
-    tables = [read_cells(path, sheet.sep) for path, sheet in zip((csv, given.places), sheets, strict=True)]
-    texts = [{name: {cells[k] for _, cells in rows} for k, name in enumerate(header)} for header, rows in tables]
-    common = {name: len(own & texts[1][name]) for name, own in texts[0].items() if name in texts[1]}
-    if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
-        fix = "add one, such as the number of the pose"
-        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
-    by = given.by or max(common, key=lambda name: common[name])
-    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
-    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
-    return found, entries
 
 
 def marker(source: Source, sheet: Sheet) -> Choice | None:
@@ -334,22 +144,23 @@ class Source:
         rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
         return rms / max(size, SMALLEST_SPREAD_M)
 
-    def conventions(self, best: float, lengths: Sequence[str]) -> Iterator[Choice]:
-        """A unit of length and `joints` with which the robot explains positions; nothing if there are none.
+    def conventions(self, best: float) -> Iterator[Choice]:
+        """Units and `joints` with which the robot explains positions; nothing if there are none.
 
         Args:
-            best: share that the best units leave with the columns as they are. lengths: units, the likeliest first.
+            best: share that the best units leave with the columns as they are.
         """
         if self.rows.sockets or self.rows.readings:
             return
-        for length in lengths:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                either = {angle: self.read(replace(self.table, length=length, angle=angle)) for angle in ("rad", "deg")}
-            turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
-            small = float(either["rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
-            angle = "rad" if small else "deg"
-            data = either[angle].largest_session()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            read = {key: self.read(replace(self.table, length=key[0], angle=key[1])) for key in product(*UNITS)}
+        turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
+        angle = "rad" if float(read["m", "rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD else "deg"
+        reach = spread(self.robot.tip_poses(read["m", angle].q)[:, :1, :3, 3])
+        unlike = {length: abs(log(spread(read[length, angle].points) / reach)) for length in UNITS_PER_METRE}
+        for length in sorted(unlike, key=lambda length: unlike[length])[:MOST_LENGTHS]:
+            data = read[length, angle].largest_session()
             found = likely_mistakes.conventions_of(self.robot, data, angle)
             for one in found:
                 text = ",".join(one.texts(self.joints, angle, UNITS_PER_METRE[length]))

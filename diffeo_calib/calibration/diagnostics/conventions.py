@@ -35,6 +35,8 @@ SMALLEST_LIMIT = 0.001
 """Of the share that a convention may leave: rows that the robot explains need none."""
 LEAST_PART, MOST_PART = 0.04, 2.2
 """Of a joint's limits, within which its values lie in the right unit."""
+LARGEST_PERCENT = 101.0
+"""Values from which joints are not -100..100 or 0..100 of their limits."""
 RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))
 """Of gears, the usual ones first."""
 RIGHT_ANGLES = {1.0: "+pi/2", -1.0: "-pi/2", 2.0: "+pi"}
@@ -55,11 +57,12 @@ class Convention:
 
     @property
     def cost(self) -> int:
-        """How many values are not those that were read; a factor of all joints counts once."""
+        """How many values are not those that were read; a factor of all joints counts once, and with it its zero."""
         own, mixed = self.matrix.diagonal(), (self.matrix != 0.0).sum(1) > 1
         factors = {round(value, 9) for value in own.abs().tolist()} - {0.0, 1.0}
-        changes = (own < 0.0).sum() + (self.offset != 0.0).sum() + mixed.sum() + (own == 0.0).sum() // 2
-        return int(changes) + len(factors)
+        zeros = [round(value, 9) for value in self.offset.tolist() if value]
+        changes = (own < 0.0).sum() + mixed.sum() + (own == 0.0).sum() // 2
+        return int(changes) + len(factors) + len(set(zeros) if factors else zeros)
 
     def texts(self, names: tuple[str, ...] | list[str], angle: str, per_metre: float) -> list[str]:
         """Expressions for `joints`: names of the columns, and the units of the table."""
@@ -200,9 +203,12 @@ class _Search:
                 mixed.append(self.starts(coupled, self.zeros(4), 3))
         if not bool(large.any()) and mixed:
             yield _joined(mixed)
-        for number, factor in enumerate(self.factors() if bool((large | small | ~turning).all()) else ()):
+        strange = bool((large | small | ~turning).all())
+        percent = float((self.q * self.per_rad)[:, turning].abs().max()) <= LARGEST_PERCENT
+        for number, factor in enumerate(self.factors()):
             part = (factor * span / width)[turning]
-            if bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
+            possible = strange or (percent and number < 2)
+            if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
                 own = self.starts(torch.where(turning, factor, 1.0)[:, None] * one, self.zeros(ZEROS // 2))
                 yield own._replace(scaled=(turning & (number < 2)).expand_as(own.offset))  # limits are rough
         for odd in (large, large | small):
@@ -227,12 +233,13 @@ class _Search:
         return [width / 200.0 * self.per_rad, width / 100.0 * self.per_rad, *plain]
 
     def zeros(self, count: int) -> Tensor:
-        """None, the middle of the limits, and random right angles: (count, n)."""
+        """None, the middle of the limits, half a turn, the lower limits, and random right angles: (count, n)."""
         generator, shape = seeded(0), (count, self.robot.n)
         quarters = torch.randint(-1, 3, shape, generator=generator, device=HOST) * (pi / 2)
         drawn = torch.rand(shape, generator=generator, dtype=torch.float64, device=HOST) < 0.5
         found = torch.where(drawn & self.turning, quarters, 0.0).double()
-        found[0], found[1] = 0.0, self.room.mean(1)
+        usual = self.room.mean(1), torch.where(self.turning, -pi, 0.0).double(), self.room[:, 0]
+        found[:4] = torch.stack([torch.zeros_like(usual[0]), *usual])[:count]
         return found
 
     def starts(self, matrix: Tensor, zeros: Tensor, most: int = 4, *, fewer: bool = True) -> _Starts:

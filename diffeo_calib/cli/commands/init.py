@@ -20,7 +20,8 @@ from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
-from diffeo_calib.cli.proposals import Choice, Source
+from diffeo_calib.cli.proposals import Source
+from diffeo_calib.cli.row_columns import Choice, rows_in, tips_of, with_places
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.files import read_joints
@@ -69,7 +70,7 @@ def run(given: InitOptions) -> None:
     output = given.output
     if given.csv.is_dir():
         read_cells(given.csv, ",")  # says why not
-    csv, joined = proposals.with_places(given.csv, given.places, output.parent)
+    csv, joined = with_places(given.csv, given.places, output.parent)
     sheet = guess_sheet(csv)
     choices = [Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])), *joined]
     try:
@@ -154,8 +155,8 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # `fit` warns of the right reading
-                rows = proposals.rows_in(csv, sheet, arm.columns)
-                tips = proposals.tips_of(rows.markers, leaves)
+                rows = rows_in(csv, sheet, arm.columns)
+                tips = tips_of(rows.markers, leaves)
                 chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
                 table = TableFormat("mm", "deg", sheet.sep, sheet.decimal)
                 seen = Source(csv, chain, arm.columns, rows, table, sheet.numbers, tips)
@@ -261,14 +262,15 @@ def _units(source: Source) -> Iterator[Choice]:
     no_length, boards = source.rows.without_length and all(source.robot.periodic), source.rows.of_boards
     lengths = ["mm"] if no_length else list(UNITS_PER_METRE)
     found = _left(source, lengths, [None], boards=boards)
-    if not all(source.robot.periodic) and not proposals.is_clear(found, CLEAR_RATIO):
-        others = _left(source, lengths, lengths, boards=boards)
+    doubtful = found[0][0] > DOUBTFUL or not proposals.is_clear(found, CLEAR_RATIO)
+    if not all(source.robot.periodic) and doubtful:
+        others = sorted([*found, *_left(source, lengths, lengths, boards=boards)], key=lambda entry: entry[0])
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
     (best, (length, angle, slides, camera)), *others = found
     named = [
-        entry
-        for entry in found
-        if not proposals.other_units(source, replace(source.table, length=entry[1][0], angle=entry[1][1]))
+        (left, key)
+        for left, key in found
+        if not proposals.other_units(source, replace(source.table, length=key[0], angle=key[1]))
     ]
     by_names = not proposals.is_clear(found, CLEAR_RATIO) and 0 < len(named) < len(found)
     if by_names := by_names and named[0][0] < CLEAR_RATIO * best:
@@ -277,8 +279,7 @@ def _units(source: Source) -> Iterator[Choice]:
     poses = [] if clear else list(proposals.rotation(source, camera=True))
     if best == inf and not poses:
         source.read_residual(replace(source.table, length=length, angle=angle))  # says why
-    likely = list(dict.fromkeys(key[0] for _, key in found))[:2]
-    meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best, likely))
+    meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best))
     if not clear and not poses and not meant:
         got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in found)
         fix = (
