@@ -262,11 +262,11 @@ class RowGroups:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
         """
         held, labels = self._divided
-        units, names, test = labels.numpy(), np.array(self.device_names), np.zeros(len(self.q), dtype=bool)
+        units, names, test = labels.numpy(), np.array(self._devices), np.zeros(len(self.q), dtype=bool)
         test[held] = out = ~in_train(labels, fraction, seed, self._kind)
         for name in np.unique(names[test]):
             own = (names == name) & (name != "")
-            for unit in np.unique(units[out & own[held]]) if own.sum() > FEWEST_PER_DEVICE else ():
+            for unit in np.unique(units[out & own[held]]) if own.sum() >= FEWEST_PER_DEVICE else ():
                 if (own & ~test).sum() < FEWEST_PER_DEVICE and (test[held] & (units != unit)).any():
                     test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
@@ -287,6 +287,11 @@ class RowGroups:
         fold = np.full(len(self.q), -1)
         fold[held] = fold_numbers(units, k, seed, self._kind)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
+
+    @property
+    def _devices(self) -> Sequence[str]:
+        """The device of each row; those of other kinds are others."""
+        return self.device_names
 
     @property
     def _divided(self) -> tuple[np.ndarray, Tensor]:

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from table_bank import says, some
 
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE, REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
@@ -91,6 +93,14 @@ def test_a_device_keeps_the_rows_that_place_it(seed: int) -> None:
     lone = some(10).with_sessions(["few"] * 10)
     assert len(lone.split(0.3, seed)[1]) == 2
     assert len(lone.rows(slice(0, 5)).split(0.6, seed)[1]) == 2  # too few in any case
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_devices_of_other_kinds_are_others_whatever_their_names(seed: int) -> None:
+    table, names = some(30), ["one"] * 9 + ["two"] * 21
+    given = table.q, torch.ones(30, dtype=torch.float64), names, table.joint_names
+    train, _ = Observations.joined([Readings.distances(*given), Readings.heights(*given)]).split(0.6, seed)
+    assert all(part.device_names.count("one") >= FEWEST_PER_DEVICE for part in train.parts)
 
 
 def test_split_refuses_what_cannot_be_split() -> None:
