@@ -74,7 +74,8 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
 
 def marker(source: Source, sheet: Sheet) -> Choice | None:
     """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
-    for length, angle in product(("mm", "m"), ("deg", "rad")) if len(source.rows.markers) == 1 else ():
+    alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
+    for length, angle in product(("mm", "m"), ("deg", "rad")) if alone else ():
         with warnings.catch_warnings(), suppress(DiffeoCalibError):
             warnings.simplefilter("ignore")
             data = source.read(TableFormat(length, angle, sheet.sep, sheet.decimal))
@@ -154,7 +155,10 @@ class Source:
             return
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            read = {key: self.read(replace(self.table, length=key[0], angle=key[1])) for key in product(*UNITS)}
+            tables = {key: replace(self.table, length=key[0], angle=key[1]) for key in product(*UNITS)}
+            read = {key: own for key, table in tables.items() if (own := measured_positions(self.read(table)))}
+        if not read:
+            return
         turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
         angle = "rad" if float(read["m", "rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD else "deg"
         reach = spread(self.robot.tip_poses(read["m", angle].q)[:, :1, :3, 3])
