@@ -33,9 +33,9 @@ ROLES = {
 }
 """What words of names say: a rate is anything but a place or a joint's value, an external axis is beside the arm's."""
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
-UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "in", "rad", "mrad", "deg", "kg")}
-UNITS |= {"inch": "in", **dict.fromkeys(("degree", "degrees", "grad"), "deg")}
-LENGTHS = {"mm", "m", "cm", "um", "in"}
+UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "kg")}
+UNITS |= {"in": "inch", **dict.fromkeys(("degree", "degrees", "grad"), "deg")}
+LENGTHS = {"mm", "m", "cm", "um", "inch"}
 SAID = WORDS["measured"] | WORDS["wished"] | WORDS["deviation"]
 GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "position", "trans", "tcp"} - {"q"}}
 GLUED |= {"d": "err", "e": "err", "s": "std"}
@@ -51,7 +51,7 @@ class Column:
 
     Args:
         name: as written. words: in lower case, without the unit; numbers and axes are words of their own.
-        unit: mm, m, cm, um, in, rad, mrad, deg or kg; empty where the name says none.
+        unit: mm, m, cm, um, inch, rad, mrad, deg or kg; empty where the name says none.
     """
 
     name: str

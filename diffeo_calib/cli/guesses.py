@@ -134,7 +134,7 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointCol
     Names are compared without what all have in common before or after, and as numbered series such as q1, q2, ...
     What encoders reported comes before what nothing is said of, and this before what was commanded.
     """
-    if columns and all(name.isdecimal() for name in columns) and len(columns) > len(joints):
+    if columns and all(name.isdecimal() for name in columns) and len(columns) >= len(joints) + 3:
         return [JointColumns([*columns[: len(joints)]], "the first columns: no line of the file names them", ())]
     if set(joints) <= set(columns):
         return [JointColumns(list(joints), "named as in the URDF", ())]

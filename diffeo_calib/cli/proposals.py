@@ -75,7 +75,7 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
 def marker(source: Source, sheet: Sheet) -> Choice | None:
     """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
     alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
-    for length, angle in product(("mm", "m"), ("deg", "rad")) if alone else ():
+    for length, angle in product(*UNITS) if alone else ():
         with warnings.catch_warnings(), suppress(DiffeoCalibError):
             warnings.simplefilter("ignore")
             data = source.read(TableFormat(length, angle, sheet.sep, sheet.decimal))
@@ -153,18 +153,16 @@ class Source:
         """
         if self.rows.sockets or self.rows.readings:
             return
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            tables = {key: replace(self.table, length=key[0], angle=key[1]) for key in product(*UNITS)}
-            read = {key: own for key, table in tables.items() if (own := measured_positions(self.read(table)))}
-        if not read:
-            return
-        turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
-        angle = "rad" if float(read["m", "rad"].q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD else "deg"
-        reach = spread(self.robot.tip_poses(read["m", angle].q)[:, :1, :3, 3])
-        unlike = {length: abs(log(spread(read[length, angle].points) / reach)) for length in UNITS_PER_METRE}
-        for length in sorted(unlike, key=lambda length: unlike[length])[:MOST_LENGTHS]:
-            data = read[length, angle].largest_session()
+        likely, turning = list[tuple[float, str, str, Measurements]](), torch.tensor(self.robot.periodic, device=HOST)
+        for length, angle in product(*UNITS):
+            own = self.positions(length, angle)
+            if own is None or length in (entry[1] for entry in likely):
+                continue
+            small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+            moved = spread(self.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
+            if (angle == "deg" or small) and min(moved) > 0.0:
+                likely.append((abs(log(moved[0] / moved[1])), length, angle, own))
+        for _, length, angle, data in sorted(likely, key=lambda entry: entry[0])[:MOST_LENGTHS]:
             found = likely_mistakes.conventions_of(self.robot, data, angle)
             for one in found:
                 text = ",".join(one.texts(self.joints, angle, UNITS_PER_METRE[length]))
@@ -178,6 +176,14 @@ class Source:
                 yield Choice("length", length, "with these joints")
                 yield Choice("angle", angle, "the same")
                 return
+
+    def positions(self, length: str, angle: str) -> Measurements | None:
+        """Measured positions of the largest set-up, read in these units; None if the file says others."""
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
+            return None if found is None else found.largest_session()
+        return None
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""
@@ -233,11 +239,11 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
     Where it does not tell them apart either, a remark for each asks the user.
     """
     best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
-    for length in ("m", "mm") if len(equal) > 1 else ():
+    for length in UNITS_PER_METRE if len(equal) > 1 else ():
         tables = {angle: replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")}
         tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
         (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
-        clear.append((second / least if 0 < least < inf else 1.0, own))
+        clear.append((second / least if 0 < least < LARGEST_RESIDUAL else 1.0, own))
     ratio, taken = max(clear, key=lambda entry: entry[0])
     if len(equal) > 1 and ratio < gates.READINGS_TOLD_APART:
         why = "uncomment the right line"
@@ -251,12 +257,10 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
 def measured(source: Source) -> Source:
     """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
     found, several = dict[int, str](), len(source.rows.markers) > 1
-    for length, angle in product(("m", "mm"), ("rad", "deg")) if several else ():
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
-            positions = measured_positions(source.read(replace(source.table, length=length, angle=angle)))
-            every = [] if positions is None else unmeasured_markers(source.robot, positions.largest_session())
-            found = found or {marker: words for marker, words, _ in every}
+    for length, angle in product(*UNITS) if several else ():
+        positions = source.positions(length, angle)
+        every = [] if positions is None else unmeasured_markers(source.robot, positions)
+        found = found or {marker: words for marker, words, proved in every if proved}
     rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
     rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
@@ -282,17 +286,24 @@ def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
     return best < LARGEST_RESIDUAL and all(value >= ratio * best for value, _ in others)
 
 
+def rotations(source: Source) -> list[tuple[Sequence[str], str]]:
+    """The columns of a rotation of each marker, by their names, and what these usually mean."""
+    if source.rows.matrix:
+        return [(source.rows.matrix, "a matrix")]
+    used = {*source.joints, *(name for triple in source.rows.markers for name in triple)}
+    others = [name for name in source.numbers if name not in used]
+    guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
+    return [one for one in guessed if one is not None]
+
+
 def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     """A rotation: the convention with which the nominal robot explains the poses clearly better than with all others.
 
     With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. Nothing if there
     are no columns of a rotation; a remark, but for a camera, if no convention is clearly better.
     """
-    used, table = {*source.joints, *(name for triple in source.rows.markers for name in triple)}, source.table
-    others = [name for name in source.numbers if name not in used]
-    guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
-    found = [(source.rows.matrix, "a matrix")] if source.rows.matrix else [one for one in guessed if one is not None]
-    if not found:
+    found, table = rotations(source), source.table
+    if not found or source.marker is not None:
         return
     each, names = [list(own) for own, _ in found], list(dict.fromkeys(name for own, _ in found for name in own))
     own_body = len(source.rows.markers) == max(len(source.tips), 1) == len(each) and len(names) == sum(map(len, each))

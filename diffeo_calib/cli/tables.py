@@ -130,7 +130,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
         if own.marker is not None and "=" not in own.marker:
             order = _read_options(shlex.split(command), Rows).get("--marker", [""])[-1].partition("=")[1:]
             own = replace(own, marker=own.marker + "".join(order))
-            add_to_command_line(["--marker", own.marker])
+            add_to_command_line(["--marker", str(own.marker)])
         completed = _completed(own, words), _completed(units, words)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"

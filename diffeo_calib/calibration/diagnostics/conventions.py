@@ -184,8 +184,10 @@ class _Search:
     @property
     def room(self) -> Tensor:
         """(n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]."""
-        ends = torch.where(self.turning, pi, 1.0)[:, None] * self.robot.limits.sign()
-        return torch.where(self.robot.limits.isfinite(), self.robot.limits, ends)
+        limits = self.robot.limits
+        half = torch.where(self.turning, pi, 1.0).to(limits)[:, None]
+        known = limits.isfinite() & (limits[:, 1:] > limits[:, :1])
+        return torch.where(known, limits, torch.cat([-half, half], 1))
 
     def tried(self) -> Iterator[_Starts]:
         """Starts: signs and zeros; exchanged or coupled columns; other units of all joints, and of some."""
@@ -204,8 +206,8 @@ class _Search:
         if not bool(large.any()) and mixed:
             yield _joined(mixed)
         strange = bool((large | small | ~turning).all())
-        percent = float((self.q * self.per_rad)[:, turning].abs().max()) <= LARGEST_PERCENT
-        for number, factor in enumerate(self.factors()):
+        percent = bool(((self.q * self.per_rad)[:, turning].abs() <= LARGEST_PERCENT).all())
+        for number, factor in enumerate(self.factors() if bool(turning.any()) else ()):
             part = (factor * span / width)[turning]
             possible = strange or (percent and number < 2)
             if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):

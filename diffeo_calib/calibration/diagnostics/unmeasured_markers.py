@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import combinations
-from math import inf, isfinite
+from math import inf
 from typing import NamedTuple
+
+import torch
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.likely_mistakes import residual_of
@@ -31,7 +33,8 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         robot: n joints. data: N rows of one set-up.
     """
     places, turns, size = data.origins, robot.tip_poses(data.q)[..., :3, :3], spread(data.points)
-    turning = float((turns - turns[:1]).abs().max()) > gates.MOVED_RAD_M
+    about = torch.linalg.svdvals((turns - turns[:1]).reshape(-1, 3))  # of turns about one axis the last one is 0
+    turning = float(about[-1]) > gates.MOVED_RAD_M * len(turns) ** 0.5
     for one, other in combinations(range(places.shape[1]), 2):
         away = places[:, other] - places[:, one]
         away = away[~away.isnan().any(-1)]
@@ -40,14 +43,15 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         shifted = bool(away.any())
         if not shifted or (turning and float((away - away.median(0).values).abs().max()) < gates.DIGITS_SHARE * size):
             words = f"marker {other} is a copy of marker {one}" + ", shifted by the same in every row" * shifted
-            yield Unmeasured(other, words, not shifted)
+            yield Unmeasured(other, words, proved=True)
     tips = data.bodies.tips(data.on or robot.tips[:1] * data.points.shape[1])
     if robot.n < gates.NOMINAL_JOINTS or len(set(tips)) == len(tips):
         return
     own = [_residual(robot, data, k, tip) for k, tip in enumerate(tips)]
     for k, typical in enumerate(own):
         far = max(other for other, tip in zip(own, tips, strict=True) if tip == tips[k])
-        if isfinite(far) and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
+        explained = gates.DIGITS_SHARE * size < far < gates.RIGHT_READING * size
+        if explained and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
             yield Unmeasured(k, f"{words}: wished places", typical < gates.DIGITS_SHARE * size)
 
@@ -63,7 +67,8 @@ def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:
 def check_markers(robot: Tree, data: Measurements) -> None:
     """Refuse markers that are no measurements, with the proof; warn of doubtful ones."""
     for marker, words, proved in unmeasured_markers(robot, data):
-        names = data.origin.columns.triples[marker] if isinstance(data.origin, TableOrigin) else [f"marker {marker}"]
+        triples = data.origin.columns.triples if isinstance(data.origin, TableOrigin) else []
+        names = triples[marker] if len(triples) == data.markers else [f"marker {(data.marker_names or range(data.markers))[marker]}"]
         fix = f"leave {few(names)} out: wished or computed places, or the same marker twice, are no measurements"
         if proved:
             raise MeasurementError.of(words, fix=fix)

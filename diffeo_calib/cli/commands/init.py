@@ -165,9 +165,13 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 seen = proposals.measured(seen)
                 seen = replace(seen, marker=proposals.marker(seen, sheet))
                 units = list(_units(seen))
-                names = [choice for choice in units if choice.name == "joints"] or names
+                meant = [choice for choice in units if choice.name == "joints"]
+                names = meant or names
                 seen = replace(seen, joints=str(names[0].value).split(",")) if names[0].sure else seen
                 units = [choice for choice in units if choice.name != "joints"]
+                if meant:  # the robot explains the rows only now
+                    seen = proposals.measured(seen)
+                    seen = replace(seen, marker=seen.marker or proposals.marker(seen, sheet))
                 one = _with_tip(robot, Explained(arm, "", seen, names, units))
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
@@ -226,14 +230,15 @@ def _with_tip(robot: Path, found: Explained) -> Explained:
     table, left_out = _format(units, seen), list[str]()
     q = read_joints(seen.csv, seen.joints, table, kinds=seen.robot.kinds)
     moved = (q.amax(0) - q.amin(0)).tolist()
-    while len(arm.joints) > 1 and not seen.tips:
+    while len(arm.joints) > 1 and not seen.tips and names[0].sure:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
         without = replace(seen, robot=load_robot(robot, shorter.links), joints=seen.joints[:count])
         if moved[count] < UNMOVED_JOINT_RANGE:
             left_out.append(f"{last} hardly moves in the table")
         else:
-            an_arm_s = moved[count] > median(moved) / 2  # its axis may run through the marker
+            # its axis may run through the marker, and a pose shows that it turns where a place does not
+            an_arm_s = moved[count] > median(moved) / 2 or bool(proposals.rotations(seen))
             size, residual = seen.residual(table), without.residual(table)
             if size > proposals.LARGEST_RESIDUAL or residual > size * (1 / CLEAR_RATIO if an_arm_s else NOT_RAISED):
                 break
@@ -242,7 +247,8 @@ def _with_tip(robot: Path, found: Explained) -> Explained:
         arm, seen = shorter, without
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
     names = [names[0]._replace(value=",".join(seen.joints))] if names[0].sure else names
-    return Explained(arm, why, seen, names, list(_units(seen)) if left_out else units)
+    units = [choice for choice in _units(seen) if choice.name != "joints"] if left_out else units
+    return Explained(arm, why, seen, names, units)
 
 
 def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
@@ -282,13 +288,10 @@ def _units(source: Source) -> Iterator[Choice]:
     meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best))
     if not clear and not poses and not meant:
         got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in found)
-        fix = (
-            "no signs, zeros, coupling or units of the joints do either: check the table's joints against the URDF, or "
-        )
-        fix += (
-            "write the file yourself; of a robot with several tips the columns of each are to be named after it, such "
-        )
-        fix += "as left_x"
+        sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
+        fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
+        fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
+        fix += "the columns of each are to be named after it, such as left_x"
         what = "units with which the robot explains what the rows vary"
         raise InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
     if poses or meant:
@@ -306,9 +309,10 @@ def _units(source: Source) -> Iterator[Choice]:
 
 def _left(source: Source, lengths: list[str], slides: list[Any], *, boards: bool) -> list[tuple[float, Any]]:
     """Share of the rows that is left with units of length and angle, of slides, and with the camera on the tool."""
+    angles = ("rad", "deg") if any(source.robot.periodic) else ("rad",)
     formats = {
         key: replace(source.table, length=key[0], angle=key[1], joint_length=key[2], camera_on_tool=bool(key[3]))
-        for key in product(lengths, ("rad", "deg"), slides, ("", "camera on the tool") if boards else ("",))
+        for key in product(lengths, angles, slides, ("", "camera on the tool") if boards else ("",))
         if key[2] != key[0]
     }
     return proposals.residuals(source, formats)
