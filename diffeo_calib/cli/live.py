@@ -94,7 +94,8 @@ class Live:
         numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
         found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
         found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
-        found |= {name: getattr(source, name) for name in ("position", "session", "sockets", "readings")}
+        found |= {name: getattr(source.columns, name) for name in ("session", "sockets", "readings")}
+        found["position"] = [",".join(triple) for triple in source.columns.position or ()]
         found["joints"] = joint_columns(source.joints, robot)
         texts = {name: str(value) for name, value in found.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
