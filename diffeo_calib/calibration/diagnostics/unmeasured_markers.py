@@ -68,7 +68,8 @@ def check_markers(robot: Tree, data: Measurements) -> None:
     """Refuse markers that are no measurements, with the proof; warn of doubtful ones."""
     for marker, words, proved in unmeasured_markers(robot, data):
         triples = data.origin.columns.triples if isinstance(data.origin, TableOrigin) else []
-        names = triples[marker] if len(triples) == data.markers else [f"marker {(data.marker_names or range(data.markers))[marker]}"]
+        numbers = data.marker_names or range(data.markers)
+        names = triples[marker] if len(triples) == data.markers else [f"marker {numbers[marker]}"]
         fix = f"leave {few(names)} out: wished or computed places, or the same marker twice, are no measurements"
         if proved:
             raise MeasurementError.of(words, fix=fix)
