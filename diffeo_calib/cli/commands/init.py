@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product, takewhile
 from math import inf
@@ -50,7 +50,7 @@ class Arm(NamedTuple):
 
     Args:
         links: the options that name them. joints: their names. ends: the link behind each. columns: of each.
-        how: these were found.
+        how: these were found. lacking: joints behind them that no column is named after.
     """
 
     links: Links
@@ -58,11 +58,12 @@ class Arm(NamedTuple):
     ends: list[str]
     columns: list[str]
     how: str
+    lacking: Sequence[str] = ()
 
     def first(self, count: int) -> Arm:
         """The first joints of these alone."""
         links = replace(self.links, tip=[self.ends[count - 1]])
-        return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how)
+        return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how, self.lacking)
 
 
 def run(given: InitOptions) -> None:
@@ -151,7 +152,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     """The joints, or the convention, that explain the rows; InputError if none do, or several."""
     found, refused = dict[tuple[str | None, ...], Explained](), list[InputError]()
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
-    for arm in _arms(robot, sheet):
+    for arm in (arms := _arms(robot, sheet)):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # `fit` warns of the right reading
@@ -177,7 +178,9 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
         except InputError as error:
             refused.append(error)
     if not found:
-        raise refused[0]
+        lacking = next((arm.lacking for arm in arms if arm.lacking), ())
+        more = f" No column is named after {few(lacking, 20)}." if lacking else ""
+        raise type(refused[0])(f"{refused[0]}{more}")
     if len(found) == 1:
         return next(iter(found.values()))
     best = min(found.values(), key=lambda one: one.seen.residual(_format(one.units, one.seen)))
@@ -210,7 +213,8 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
             guessed = guess_joints(sheet.numbers, joints[:count])
             series = bool(guessed) and guessed[0].how.startswith("numbered")
             if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
-                arm = Arm(options, joints[:count], ends, guessed[0].names, guessed[0].how)
+                lacking = joints_without_column(sheet.numbers, joints) if count < len(joints) else ()
+                arm = Arm(options, joints[:count], ends, guessed[0].names, guessed[0].how, lacking)
                 arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
                 break
     if not arms:
@@ -287,7 +291,9 @@ def _units(source: Source) -> Iterator[Choice]:
         source.read_residual(replace(source.table, length=length, angle=angle))  # says why
     meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best))
     if not clear and not poses and not meant:
-        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in found)
+        read = [(value, units) for value, units in found if value < inf]
+        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in read)
+        got += "; the units that the file states exclude others" * (len(read) < len(found))
         sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
         fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
         fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
