@@ -277,6 +277,7 @@ def _units(source: Source) -> Iterator[Choice]:
         others = sorted([*found, *_left(source, lengths, lengths, boards=boards)], key=lambda entry: entry[0])
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
     (best, (length, angle, slides, camera)), *others = found
+    excluded = found[-1][0] == inf
     named = [
         (left, key)
         for left, key in found
@@ -293,7 +294,7 @@ def _units(source: Source) -> Iterator[Choice]:
     if not clear and not poses and not meant:
         read = [(value, units) for value, units in found if value < inf]
         got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in read)
-        got += "; the units that the file states exclude others" * (len(read) < len(found))
+        got += "; the units that the file states exclude others" * excluded
         sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
         fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
         fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
