@@ -250,6 +250,8 @@ class TableFile(CsvLines):
         units = [(name, table.joint_unit if slide else table.angle) for name, slide, plain in joints if plain]
         read: dict[str, Any] = dict(units)
         read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
+        angles = len(columns.rotation) == 3 * len(columns.triples)  # not a quaternion or a matrix
+        read |= dict.fromkeys(columns.rotation if angles else (), columns.rotation_unit)
         stated = {name: stated_unit(name, self.units) for name in read}
         if not columns.kinds_known:  # the joints may be prismatic
             stated |= {name: None for name, _ in units if stated[name] not in ANGLES}
