@@ -154,7 +154,10 @@ class Source:
         """
         if self.rows.sockets or self.rows.readings:
             return
-        likely, turning = list[tuple[float, str, str, Measurements]](), torch.tensor(self.robot.periodic, device=HOST)
+        likely, turning = (
+            list[tuple[float, str, str, Measurements]](),
+            torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST),
+        )
         for length, angle in product(*UNITS):
             own = self.positions(length, angle)
             if own is None or length in (entry[1] for entry in likely):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -23,7 +24,7 @@ from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
@@ -382,8 +383,9 @@ def _number_columns(csv: Path, rows: Rows, table: TableFormat) -> list[str]:
     """The columns of a table, if a reading may be meant as a number or as the name of one."""
     if not csv.is_file() or all(_number(text.partition("=")[2]) is None for text in rows.reading or ()):
         return []
-    with CsvLines(csv, table.sep) as file:
+    with suppress(MeasurementError), CsvLines(csv, table.sep) as file:  # rows may come later
         return file.header
+    return []
 
 
 def readings_columns(texts: Sequence[str], rows: Rows, names: Sequence[str] = ()) -> tuple[Any, ...]:
