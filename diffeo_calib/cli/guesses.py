@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,7 +78,7 @@ def guess_sheet(path: Path) -> Sheet:
         file = CsvLines(path, sep)
         try:
             with file:
-                rows = [line for block in file.blocks() for line in block][:ROWS_LOOKED_AT]
+                rows = list(islice((line for block in file.blocks(ROWS_LOOKED_AT) for line in block), ROWS_LOOKED_AT))
         except MeasurementError as error:
             reasons.append((len(file.header), error))
             continue

@@ -18,6 +18,7 @@ from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.expressions import JointExpressions
 
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""
@@ -67,6 +68,7 @@ class Live:
         """Go on after the lines that the journal knows."""
         known = [one for one in self.journal.entries if "line" in one]
         lines = self.table.new_lines()
+        self._check_header()
         for number, entry in enumerate(known):
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
@@ -86,6 +88,17 @@ class Live:
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
+
+    def _check_header(self) -> None:
+        """Raise InputError where columns are named by their places and the first line is a row."""
+        named = {cell.strip() for cell in self.table.cells(self.table.header)}
+        joints = JointExpressions.of(joint_columns(self.source.joints, self.campaign.robot)).columns
+        places = [name for name in joints if name.isdecimal() and name not in named]
+        if self.table.header and places:
+            what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
+            raise InputError.of(
+                what, got=f"the first line {few(sorted(named))}", fix="name the columns in its first line"
+            )
 
     def _begun(self) -> dict[str, str]:
         """What rows are read and judged with; of long texts their hashes."""

@@ -33,6 +33,7 @@ from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
+from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
@@ -153,7 +154,10 @@ class Source:
         """
         if self.rows.sockets or self.rows.readings:
             return
-        likely, turning = list[tuple[float, str, str, Measurements]](), torch.tensor(self.robot.periodic, device=HOST)
+        likely, turning = (
+            list[tuple[float, str, str, Measurements]](),
+            torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST),
+        )
         for length, angle in product(*UNITS):
             own = self.positions(length, angle)
             if own is None or length in (entry[1] for entry in likely):
@@ -164,8 +168,10 @@ class Source:
                 likely.append((abs(log(moved[0] / moved[1])), length, angle, own))
         for _, length, angle, data in sorted(likely, key=lambda entry: entry[0])[:MOST_LENGTHS]:
             found = likely_mistakes.conventions_of(self.robot, data, angle)
+            joints, units = JointExpressions.of(self.joints), (angle, UNITS_PER_METRE[length])
             for one in found:
-                text = ",".join(one.texts(self.joints, angle, UNITS_PER_METRE[length]))
+                own = one.of_columns(joints.matrix, joints.offset, *units)
+                text = ",".join(own.texts(joints.columns, *units))
                 why = (
                     f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns as "
                 )

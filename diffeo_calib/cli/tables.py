@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -23,11 +24,11 @@ from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
-from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -75,7 +76,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     csv = with_places(csv, rows, table)
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
-    readings = readings_columns(rows.reading or (), rows)
+    readings = readings_columns(rows.reading or (), rows, _number_columns(csv, rows, table))
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     triples = _position_triples(rows.position or []) or None
     columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
@@ -289,7 +290,12 @@ class ProgramTable:
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
         table = with_rows(self.table, turned) if rotation else self.table
         names, triples = joint_columns(self.joints, robot), _position_triples(position)
-        data = read_observations(self.csv, TableColumns(names, triples, kinds=robot.kinds), table, duplicates="keep")
+        columns = TableColumns(names, triples, kinds=robot.kinds)
+        data = read_observations(self.csv, columns, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
+        lines = [line for line, _ in read_cells(self.csv, table.sep, columns.numeric(table).names)[1]]
+        if len(data) < len(lines):
+            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.lines.tolist()}))}"
+            raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
         return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:
@@ -373,10 +379,22 @@ def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     return (names[0], names[1]), value / table.per_metre
 
 
-def readings_columns(texts: Sequence[str], rows: Rows) -> tuple[Any, ...]:
-    """The columns of every kind of reading; those of images are of one kind, whatever number of cameras took them."""
+def _number_columns(csv: Path, rows: Rows, table: TableFormat) -> list[str]:
+    """The columns of a table, if a reading may be meant as a number or as the name of one."""
+    if not csv.is_file() or all(_number(text.partition("=")[2]) is None for text in rows.reading or ()):
+        return []
+    with suppress(MeasurementError), CsvLines(csv, table.sep) as file:  # rows may come later
+        return file.header
+    return []
+
+
+def readings_columns(texts: Sequence[str], rows: Rows, names: Sequence[str] = ()) -> tuple[Any, ...]:
+    """The columns of every kind of reading; those of images are of one kind, whatever number of cameras took them.
+
+    A number that is one of the ``names`` of columns is that column, others are the length of a ball bar.
+    """
     corners = [text for text in texts if text.startswith(CORNERS)]
-    others = [reading_columns(text, rows.session) for text in texts if text not in corners]
+    others = [reading_columns(text, rows.session, names) for text in texts if text not in corners]
     return (*([image_columns(corners, rows)] if corners else []), *others)
 
 
@@ -398,8 +416,8 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
     return ImageColumns(cameras, rows.camera_on_tool, rows.session)
 
 
-def reading_columns(text: str, device: str | None) -> ReadingColumns:
-    """KIND=COLUMN as columns; images have two, and the four numbers of their cameras."""
+def reading_columns(text: str, device: str | None, names: Sequence[str] = ()) -> ReadingColumns:
+    """KIND=COLUMN as columns; images have two, and the four numbers of their cameras. ``names``: of all columns."""
     kind, _, rest = text.partition("=")
     words = tuple(word.strip() for word in rest.split(","))
     numbers = [_number(word) for word in words]
@@ -408,7 +426,7 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
         if fx and fy and cx is not None and cy is not None and min(fx, fy) > 0.0:
             return ReadingColumns("image", words[:2], device, intrinsics=(fx, fy, cx, cy))
     elif kind in KINDS and len(words) == 1 and words[0]:
-        value = words if numbers[0] is None else numbers[0]
+        value = words if numbers[0] is None or words[0] in names else numbers[0]
         if kind == "distance" and isinstance(value, float) and value <= 0.0:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)

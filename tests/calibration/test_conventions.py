@@ -11,6 +11,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.conventions import socket_projector
 from diffeo_calib.calibration.diagnostics.likely_mistakes import conventions_of
+from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -76,6 +77,17 @@ def test_signs_and_zeros_of_a_scara() -> None:
     read[:, 1] -= math.pi / 2
     read[:, 0] += 1.0
     assert found(SCARA, read, points) == ["a,{b}+90,-{c},d"]
+
+
+def test_expressions_that_were_read_are_composed() -> None:
+    """Not nested: "-{-{b}+90}"."""
+    q, points = measured(SCARA)
+    read = q.clone()
+    read[:, 1] *= -1
+    (one,) = conventions_of(robot(*SCARA), dc.Measurements(read, points, doubt=False), "deg")
+    given = JointExpressions.of(["a", "-{b}+90", "c", "{d}+{b}"])
+    own = one.of_columns(given.matrix, given.offset, "deg", 1.0)
+    assert own.texts(given.columns, "deg", 1.0) == ["a", "{b}-90", "c", "{b}+{d}"]
 
 
 def test_nothing_is_proposed_for_a_right_table_of_a_wrong_robot() -> None:

@@ -86,8 +86,16 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
     units = Units(length="mm", angle="deg", sep=";", decimal=",")
     table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
-    assert table.readings == (columns,)
+    assert table.columns.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
+
+
+def test_a_number_that_names_a_column_is_that_column(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b,7\n10,20,100\n20,30,400\n")
+    for text, values in {"7": ("7",), "7.0": 7.0}.items():
+        rows, units = Rows(reading=[f"distance={text}"]), Units(length="mm", angle="deg")
+        table = measured_table(tmp_path / "t.csv", rows, units)
+        assert table.columns.readings == (ReadingColumns("distance", values),)
 
 
 @pytest.mark.parametrize(
@@ -139,4 +147,4 @@ def test_several_kinds_are_one_table(tmp_path: Path) -> None:
     data = measured_table(csv, rows, units).read(arm)
     assert (data.kinds, data.device_names) == (("position", "distance", "socket"), ["", "device", ""])
     named = measured_table(csv, Rows(reading=["distance=C"], session="who"), units)
-    assert named.readings[0].device == "who"
+    assert named.columns.readings[0].device == "who"

@@ -91,8 +91,8 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
 
 
-@pytest.mark.parametrize("offset", [0.0, 1.37])
-def test_recordings_with_clocks_of_their_own(offset: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("offset", [0.0, 1.37, None])  # None: both on the same grid of times
+def test_recordings_with_clocks_of_their_own(offset: float | None, tmp_path: Path) -> None:
     """One line for every stop, from its middle; columns that only count or that do not move do not matter."""
     rng = np.random.default_rng(0)
     ends = np.cumsum(rng.uniform(1.0, 2.0, 12))
@@ -104,10 +104,14 @@ def test_recordings_with_clocks_of_their_own(offset: float, tmp_path: Path) -> N
             (goals[k + 1] - goals[k]) * np.clip((times - end) / 0.5, 0.0, 1.0) for k, end in enumerate(ends)
         )
 
-    one, two = np.arange(0.0, 20.0, 0.01), np.arange(0.4, 19.0, 0.037)
-    joints = ("t,n,a,c", *(f"{t:.3f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
+    one, two = np.arange(0.0, 20.0, 0.01), np.arange(0.4, 19.0, 0.037 if offset is not None else 0.01)
+    offset = offset or 0.0
+    joints = ("t,n,a,c", *(f"{t:.4f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
     seen = at(two)[:, None] * [1.0, 2.0, -3.0] + rng.normal(0.0, 0.01, (len(two), 3))
-    places = ("t,x,y,z", *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)))
+    places = (
+        "t,x,y,z",
+        *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)),
+    )
     found = joined(tmp_path, joints, places, "t")
     rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
     assert 8 <= len(rows) <= 13

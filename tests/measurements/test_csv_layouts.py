@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from diffeo_calib.cli.guesses import guess_joints, guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -218,6 +219,32 @@ def test_a_marker_near_the_origin_stays(read: Reader) -> None:
     assert len(read(separated(",", [NAMES, *near]), NAMES[:2], NAMES[2:], **FORMAT)) == 8
 
 
+def test_a_single_origin_not_clearly_far_away_stays(read: Reader) -> None:
+    """Tables relative to the first pose begin with it; repeated rows hide no origin either."""
+    near = [[*row[:2], f"{30 * k}", f"{k**2}", "0"] for k, row in enumerate(CELLS)]
+    assert len(read(separated(",", [NAMES, near[0], *near[2:]]), NAMES[:2], NAMES[2:], **FORMAT)) == 7
+
+
+def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
+    labelled = [["id", *NAMES], ["#1", *CELLS[0]]]
+    assert len(read(separated(",", labelled), NAMES[:2], NAMES[2:], **FORMAT)) == 1
+    disabled = [NAMES, *([f"#{row[0]}", *row[1:]] for row in CELLS[:6]), *CELLS[6:]]
+    with pytest.warns(DiffeoCalibWarning, match="6 line"):
+        assert len(read(separated(",", disabled), NAMES[:2], NAMES[2:], **FORMAT)) == 2
+    damaged = [NAMES, *CELLS[:2], ["#VALUE!", *CELLS[2][1:]], *CELLS[3:]]
+    with pytest.raises(MeasurementError, match="line 4, column 'q1': expected a number, got '#VALUE!'"):
+        read(separated(",", damaged), NAMES[:2], NAMES[2:], **FORMAT)
+
+
+def test_rows_that_count_the_columns_and_empty_headers(read: Reader, tmp_path: Path) -> None:
+    (tmp_path / "rows.csv").write_text("3,2,1\n1,2,3\n")
+    assert read_cells(tmp_path / "rows.csv", ",") == ([*"123"], [(1, [*"321"]), (2, [*"123"])])
+    with pytest.raises(MeasurementError, match="is empty"):
+        read(",,\n,,\n", ["q"], ["x", "y", "z"], **FORMAT)
+    with pytest.raises(MeasurementError, match="no column"):
+        read(",,\n1,2,3\n", ["q"], ["x", "y", "z"], **FORMAT)
+
+
 def test_a_growing_table_keeps_every_row(tmp_path: Path) -> None:
     """Rows that come one by one cannot be judged by those that come later."""
     (tmp_path / "table.csv").write_text(lost(3))
@@ -226,10 +253,9 @@ def test_a_growing_table_keeps_every_row(tmp_path: Path) -> None:
 
 
 def test_joints_without_names_are_the_first_columns() -> None:
-    assert guess_joints([*"123456789"], ["a", "b", "c"]) == (
-        [*"123"],
-        "the first columns: no line of the file names them",
-    )
+    assert guess_joints([*"123456789"], ["a", "b", "c"]) == [
+        ([*"123"], "the first columns: no line of the file names them", ())
+    ]
 
 
 def test_a_cell_that_hides_a_column_from_the_proposal_is_named(tmp_path: Path) -> None:

@@ -169,6 +169,17 @@ def test_unlikely_units_of_rotations_cause_a_warning(
     assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
 
 
+def test_a_stated_unit_of_a_rotation_is_compared(read: Reader) -> None:
+    names = ["a [rad]", "b [rad]", "c [rad]"]
+    text = POSE_HEADER + "0,1,1,2,3,0,0,0,1"
+    for name in "abc":
+        text = text.replace(f",{name},", f",{name} [rad],", 1)
+    with pytest.raises(
+        MeasurementError, match=says("column 'a [rad]'", "expected deg, as stated", "rad in its header")
+    ):
+        read(text, **(POSE | {"rotation": names}))
+
+
 def test_likely_rotations_cause_no_warning(read: Reader) -> None:
     read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **POSE)
     read(POSE_HEADER + "0,1,1,2,3,0,6.2832,0,1", **(POSE | {"rotation_angle": "rad"}))

@@ -175,7 +175,7 @@ def test_units_must_be_named(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
     with pytest.raises(MeasurementError, match=says("nowhere.csv", "does not exist", "folder")):
         read_measurements(tmp_path / "nowhere.csv", JOINTS, POSITION, length="m", angle="rad")
-    with pytest.raises(MeasurementError, match="cannot be read"):
+    with pytest.raises(MeasurementError, match="is a folder"):
         read_measurements(tmp_path, JOINTS, POSITION, length="m", angle="rad")
 
 

@@ -10,7 +10,7 @@ found, so that many starts are cheap. What is left is judged by a rigid registra
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import degrees, pi
 from typing import NamedTuple
@@ -73,8 +73,19 @@ class Convention:
             constant = (degrees(zero) if angle == "deg" else zero) if turns else zero * per_metre
             quarters = RIGHT_ANGLES.get(round(zero / (pi / 2), 6)) if turns and angle == "rad" else None
             text = "".join(terms).removeprefix("+") + (quarters or f"{constant:+.6g}" * (constant != 0.0))
-            found.append(names[k] if text == f"{{{names[k]}}}" else text)
+            found.append(text[1:-1] if text[1:-1] in names else text)
         return found
+
+    def of_columns(self, matrix: Tensor, offset: Tensor, angle: str, per_metre: float) -> Convention:
+        """The same for cells (N, c) of columns where the joint values that were read are ``matrix @ cells + offset``.
+
+        Args:
+            matrix: (n, c). offset: (n,), in the units of the table. angle, per_metre: these units.
+        """
+        turn = pi / 180 if angle == "deg" else 1.0
+        per_unit = offset.new_tensor([turn if turns else 1.0 / per_metre for turns in self.robot.periodic])
+        own = self.matrix.to(matrix)
+        return replace(self, matrix=own @ matrix, offset=self.offset.to(offset) + own @ (per_unit * offset))
 
 
 def _term(value: float, name: str, angle: str) -> str:

@@ -302,7 +302,8 @@ def convention_words(found: Sequence[Convention], columns: Columns | None) -> st
     if columns is None:
         names, units, what = found[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
     else:
-        names, units, what = columns.joints.texts, (columns.table.angle, columns.table.joints_per_metre), ""
+        names, units, what = columns.joints.columns, (columns.table.angle, columns.table.joints_per_metre), ""
+        found = [own.of_columns(columns.joints.matrix, columns.joints.offset, *units) for own in found]
     texts = [f"joints='{','.join(own.texts(names, *units))}'" for own in found]
     doubt = ", which these rows do not tell apart" if len(texts) > 1 else ""
     return f"the rows fit{what} with {' or '.join(texts)}{doubt}"

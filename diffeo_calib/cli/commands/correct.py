@@ -83,7 +83,9 @@ def run(options: CorrectOptions) -> None:
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
-    robot, tools, sheet = kinematics.robot, _tools(kinematics, options, table), Program.read(program, table)
+    robot, tools = kinematics.robot, _tools(kinematics, options, table)
+    columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
+    sheet = Program.read(program, table, columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
@@ -98,7 +100,6 @@ def run(options: CorrectOptions) -> None:
     with progress_bar() as progress:
         progress("commands", 0, 1)
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
-    columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     allowed = found.q.isfinite().all(1)
     known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
     sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)

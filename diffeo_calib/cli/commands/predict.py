@@ -56,7 +56,7 @@ def run(given: PredictOptions) -> None:
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
-    mass = number(table.payload or "", ".")
+    mass = number(given.payload or "", ".")  # what the model's fit named is a column
     if mass is not None and isfinite(mass):
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:

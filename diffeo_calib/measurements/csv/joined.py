@@ -64,11 +64,11 @@ class _Table(NamedTuple):
         """The file, with the first usual separator with which it has the common column."""
         for mark in (sep, *SEPARATORS):
             with suppress(MeasurementError):
-                header, lines = read_cells(path, mark)
+                header, lines = read_cells(path, mark, (by,))
                 if by in header:
                     at = header.index(by)
                     return cls(path, header, lines, at, [cells[at] for _, cells in lines])
-        header, lines = read_cells(path, sep)
+        header, lines = read_cells(path, sep, (by,))
         return cls(path, header, lines, find_columns(path, header, [by], sep)[0], [])  # says what is wrong
 
     def numbers(self, place: int, decimal: str) -> Array:
@@ -92,11 +92,16 @@ def joined_file(
     """
     tables = table, measured = _Table.read(joints, by, sep), _Table.read(places, by, sep)
     times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
-    if 2 * len(common) < len({*measured.keys}) and all(len(own) > 1 and np.isfinite(own).all() for own in times):
-        recorded = all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times)
-        pairs, how = _at_stops(tables, times, decimal) if recorded else _by_time(*times)
+    timed = all(len(own) > 1 and np.isfinite(own).all() for own in times)
+    if timed and all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times):
+        pairs, how = _at_stops(tables, times, decimal)
+    elif timed and 2 * len(common) < len({*measured.keys}):
+        pairs, how = _by_time(*times)
     else:
-        known = {text: [row for row, own in enumerate(table.keys) if own == text] for text in common}
+        known = dict[str, list[int]]()
+        for row, text in enumerate(table.keys):
+            if text:
+                known.setdefault(text, []).append(row)
         pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in known.get(text, ())], f"by {by}"
     without = [
         f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"

@@ -36,6 +36,8 @@ HEAD = 200
 """Lines among which the header is."""
 COMMENTS = "#", "%", "//"
 """Marks that begin a comment."""
+DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
+"""Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
 BINARY = {b"PK\3\4": "a spreadsheet", b"\xd0\xcf\x11\xe0": "a spreadsheet", b"\x93NUMPY": "an array of numpy"}
 """First bytes of files that are no text, and what they are."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
@@ -85,7 +87,7 @@ class CsvLines:
             if self.sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
                 self._aligned = True
                 lines = list(islice(self._cells(), HEAD))
-            if not lines:
+            if not any(any(cells) for _, cells in lines):
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
             self._notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig")
@@ -178,7 +180,8 @@ class CsvLines:
 
     def _no_row(self, cells: Sequence[str]) -> bool:
         """Whether a line below the header is a comment, empty, or the header again."""
-        return not any(cells) or cells[: len(self.header)] == self.header or (self._commented and _is_comment(cells))
+        again = self._last > 0 and cells[: len(self.header)] == self.header  # not where columns are counted
+        return not any(cells) or again or (self._commented and _is_comment(cells))
 
     def _find_header(self, lines: Lines) -> None:
         """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
@@ -188,7 +191,8 @@ class CsvLines:
         """
         counts = [_numbers(cells) for _, cells in lines]
         comments = [_is_comment(cells) for _, cells in lines]
-        if 2 * sum(count > 0 for count, comment in zip(counts, comments, strict=True) if comment) > len(lines):
+        marked = [comment for count, comment in zip(counts, comments, strict=True) if count]
+        if marked and all(marked):
             self._commented, comments = False, [False] * len(lines)  # rows whose first cell is such as "#12"
         counts = [0 if comment else count for count, comment in zip(counts, comments, strict=True)]
         sizes = [len(cells) for count, (_, cells) in zip(counts, lines, strict=True) if count]
@@ -203,7 +207,7 @@ class CsvLines:
             for names in (cells, _uncommented(cells, width)):
                 if wanted <= {*names}:
                     place, header = k, names
-        if place < 0 < start and not wanted <= {*counted} and not comments[start - 1]:
+        if place < 0 < start and not wanted <= {*counted} and not comments[start - 1] and any(lines[start - 1][1]):
             place, header = start - 1, lines[start - 1][1]
         while place < 0 and start - 1 in rows:
             start -= 1  # few numbers, but no line names the columns
@@ -235,9 +239,10 @@ def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[s
 
 def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:
     """Place and cells of the line that names the columns of the rows from ``start`` on; -1 if none does."""
-    before = [(k, cells) for k, (_, cells) in enumerate(lines[:start]) if not comments[k]]
+    before = [(k, cells) for k, (_, cells) in enumerate(lines[:start]) if any(cells) and not comments[k]]
     if start == len(lines):
-        return before[0] if before else (0, _uncommented(lines[0][1], 0))
+        first = next(k for k, (_, cells) in enumerate(lines) if any(cells))
+        return before[0] if before else (first, _uncommented(lines[first][1], 0))
     words = [
         (k, cells)
         for k, cells in before
@@ -290,7 +295,7 @@ def _is_units(cells: Sequence[str]) -> bool:
 
 
 def _is_comment(cells: Sequence[str]) -> bool:
-    return cells[0].startswith(COMMENTS) and number(cells[0], ".") is None
+    return cells[0].startswith(COMMENTS) and number(cells[0], ".") is None and not DAMAGED.fullmatch(cells[0])
 
 
 def _uncommented(cells: list[str], width: int) -> list[str]:

@@ -94,6 +94,8 @@ class TableOrigin:
 
 FEW_ROWS = 2000
 """Rows among which those of a marker that was not seen are looked for."""
+MUCH_FARTHER = 3.0
+"""Times the largest distance of a row from its nearest one: so far is a single 0, 0, 0 where it is no position."""
 ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 
@@ -155,14 +157,16 @@ class TableFile(CsvLines):
     def _hide_zeros(self, numbers: Tensor, own: Hideable, lines: Sequence[int]) -> None:
         """Write NaN where a marker is at 0, 0, 0 though it never comes near: a device that does not see it says so.
 
-        One such row may be the origin of the frame: then all others must be farther from it than from one another.
+        One such row may be the origin of the frame, or the first pose: then all others must be much farther from it
+        than from one another.
         """
         points, q = numbers[:, own.values[:3]], numbers[:, : len(self.columns.joints.columns)]
-        lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)][:FEW_ROWS]
-        if not bool(lost.any()) or len(seen) < 2:
+        lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)]
+        some = seen[:FEW_ROWS].unique(dim=0)
+        if not bool(lost.any()) or len(some) < 2:
             return
-        apart = torch.cdist(seen, seen).fill_diagonal_(math.inf).amin(1)
-        limit = apart.median() if len(q[lost].unique(dim=0)) > 1 else apart.amax()
+        apart = torch.cdist(some, some).fill_diagonal_(math.inf).amin(1)
+        limit = apart.median() if len(q[lost].unique(dim=0)) > 1 else MUCH_FARTHER * apart.amax()
         if bool(seen.norm(dim=1).amin() > limit):
             for place in (*own.values, *own.deviations):
                 numbers[lost, place] = math.nan
@@ -246,6 +250,8 @@ class TableFile(CsvLines):
         units = [(name, table.joint_unit if slide else table.angle) for name, slide, plain in joints if plain]
         read: dict[str, Any] = dict(units)
         read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
+        angles = len(columns.rotation) == 3 * len(columns.triples)  # not a quaternion or a matrix
+        read |= dict.fromkeys(columns.rotation if angles else (), columns.rotation_unit)
         stated = {name: stated_unit(name, self.units) for name in read}
         if not columns.kinds_known:  # the joints may be prismatic
             stated |= {name: None for name, _ in units if stated[name] not in ANGLES}

@@ -129,13 +129,13 @@ class Program:
     lines: list[int]
 
     @classmethod
-    def read(cls, path: Path, table: TableFormat) -> Program:
-        """Read all cells as text.
+    def read(cls, path: Path, table: TableFormat, wanted: Sequence[str] = ()) -> Program:
+        """Read all cells as text; ``wanted`` are names of columns, by which the header is known.
 
         Raises:
             MeasurementError: a file that cannot be read, or lines of different lengths.
         """
-        header, lines = read_cells(path, table.sep)
+        header, lines = read_cells(path, table.sep, wanted)
         return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
 
     def check_free(self, names: Sequence[str]) -> None:
