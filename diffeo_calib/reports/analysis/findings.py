@@ -38,6 +38,7 @@ from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.tables import measured_positions
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -277,8 +278,8 @@ def _of_table(
     mask = mask if new else ~mask
     errors = {name: found.rows(mask) for name, found in every.items()}
     shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
-    seen = None if measured is None or not new else unseen(model, measured.q)
-    if measured is None or seen is None or not bool(seen.any()):
+    raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
+    if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
     judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
     moved = judged.causes if judged.refusal is None else [judged.refusal]
