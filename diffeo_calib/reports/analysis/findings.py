@@ -40,7 +40,7 @@ from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
-from diffeo_calib.sensors.tables import measured_positions
+from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -201,9 +201,11 @@ def find(
     rows = FitRows(model, measured)
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
-    if data is not None and (bool(unseen(model, data.q).any()) or not rows.of_positions):
+    new = None if data is None else _new_rows(model, data, rows)
+    if data is not None and new is not None and (bool(new.any()) or not rows.of_positions):
         aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
-        shown = _of_table(model, data, measured, own, _errors(data, aligned, kinematics, own, places))
+        errors = _errors(data, aligned, kinematics, own, places)
+        shown = _of_table(model, data, new, measured, own, every=errors)
     elif rows.of_positions:
         shown = _left_out(model, rows, kinematics)
     else:
@@ -266,15 +268,34 @@ def _errors(
     return found | {last: residuals(stages[last], own, data)}
 
 
+def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
+    """(N,) which rows took no part in the fit, nor in a registration: those of other kinds than its rows never did."""
+    new = unseen(model, data.q)
+    if rows.of_positions and model.registration is None:
+        other = torch.ones_like(new)
+        own = divided(data)[0]
+        seen = None if own is None else measured_rows(own.table)
+        if own is not None and seen is not None:
+            other[own.rows[seen.rows].to(HOST)] = False
+        new |= other
+    return new
+
+
 def _of_table(
-    model: CalibratedKinematics, data: Any, measured: Measurements | None, own: Places, every: Mapping[str, Evaluations]
+    model: CalibratedKinematics,
+    data: Any,
+    mask: Tensor,
+    measured: Measurements | None,
+    own: Places,
+    *,
+    every: Mapping[str, Evaluations],
 ) -> Shown:
     """Rows that the model has not seen; if there are none, all as fitted.
 
     Args:
-        measured: their positions in the frame of the model. own: places of the devices. every: errors of all by stage.
+        mask: (N,) which rows are new. measured: positions of all in the frame of the model.
+        own: places of the devices. every: errors of all by stage.
     """
-    mask = unseen(model, data.q)
     new = bool(mask.any())
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
