@@ -51,7 +51,7 @@ def is_urdf(path: Path) -> bool:
     if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
         return True
     text = read_regular(path, "robot's description", LARGEST_FILE)
-    return text.lstrip(b"\xef\xbb\xff\xfe\0 \t\r\n\v\f")[:1] == b"<"  # of any encoding, behind its mark
+    return text.lstrip(b"\xef\xbb\xbf\xff\xfe\0 \t\r\n\v\f")[:1] == b"<"  # of any encoding, behind its mark
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
