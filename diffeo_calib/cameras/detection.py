@@ -168,6 +168,10 @@ def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
                 each = (([layout[n] for n in numbers.tolist()], corners, grey) for grey, numbers, corners in seen)
                 share = max(misfit(np.concatenate(p), at.reshape(-1, 2), grey)[1] for p, at, grey in each)
                 best, likely = (share, text) if share < 0.8 * best else (best, likely)
+    if likely is not None and set(board.layout).issuperset(every.tolist()):
+        found = Board.of(likely).layout
+        if all(np.allclose(found[number], board.layout[number]) for number in every.tolist()):
+            return None
     return likely
 
 

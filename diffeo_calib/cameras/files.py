@@ -31,14 +31,18 @@ FORMS = (
 )
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Of lenses as files hold them; those after k3 must be zero."""
-MODELS = {"plumb_bob", "radtan", "radial-tangential", "brown_conrady", "rational_polynomial", "none"}
-"""Names of the distortion that is read."""
+MODELS = {"plumbbob", "radtan", "radialtangential", "brown", "brownconrady", "rationalpolynomial", "opencv", "pinhole"}
+"""Names of the distortion that is read, without what joins their words."""
+NOT = {"0", "false", "no", "none", "off"}
+"""Values of names of lenses that are none of them."""
 READ = "a pinhole with plumb_bob or radtan, 0 after k1, k2, p1, p2, k3"
 MODEL_NAMES = re.compile("model|type|lens|distortion|projection|fisheye|^xi$")
 BENT = re.compile(
-    r"fisheye|equidist|equisolid|stereographic|kannala|omni|unified|\b(mei|ds|eucm|fov|xi)\b|double.?sphere|theta"
+    r"\b(fish ?eye|equi|equi(dist|solid)\w*|stereographic|kannala\w*|omni(dir\w*)?|unified|eucm|double ?sphere"
+    r"|f?theta)\b"
 )
-"""Words of lenses that are not read even without distortion; and names of lines with such words."""
+BENT_WHOLE = {"mei", "ds", "ucm", "fov", "xi", "kb", "kb4"}
+"""Words of lenses that are not read even without distortion, anywhere or as a whole name or value."""
 OTHER = re.compile("inverse|modified|division|prism")
 """Words of another distortion."""
 WORD = re.compile(r"""(?<![\w.])["']?([A-Za-z_][\w.]*)(?:["'][ \t]*:|[ \t]*:(?=[\s\[{"']|$))""")
@@ -108,16 +112,17 @@ class _Lines:
         self.what, self.words, self.written = f"file '{file}'", dict[str, list[list[str]]](), dict[str, str]()
         if text.lstrip().startswith("<"):
             text = re.sub(r"<(\w+)[^<>]*>", r"\n\1: ", re.sub("<[/!?][^<>]*>", "\n", text))
+        text = re.sub("#.*", "", text)
         if text.count("[") != text.count("]"):
             raise InputError.of(self.what, expected=FORMS, got="a list without an end", fix="check the file")
-        parts, matrix = WORD.split(re.sub("#.*", "", text)), ""
+        parts, matrix = WORD.split(text), ""
         for name, value in zip(parts[1::2], parts[2::2], strict=True):
             short = name.rpartition(".")[2].lower().replace("_", "")
             if short in ("rows", "cols", "dt", "typeid"):
                 continue
             matrix = short if short != "data" else matrix
             words = [word for word in re.split(r"[\s,\[\]{}\"'|]+", value) if word.strip("-.") and word[0] != "!"]
-            if words or "[" in value or short == "data":
+            if words or ("[" in value and "{" not in value) or short == "data":
                 self.written[matrix] = name if name != "data" else self.written.get(matrix, "")
                 self.words.setdefault(matrix, []).append(words)
 
@@ -160,12 +165,12 @@ class _Lines:
         """k1, k2, p1, p2, k3."""
         lens, other = f"the lens of {self.what}", ""
         for name, (words, *_) in self.words.items():
-            text = " ".join([self.written[name], *words])
-            if not MODEL_NAMES.search(name) or words[:1] in ([], ["0"], ["false"]):
+            text, value = " ".join([self.written[name], *words]), re.sub(r"[\s_-]", "", "".join(words).lower())
+            if not MODEL_NAMES.search(name) or not words or words[0].lower() in NOT:
                 continue
-            if BENT.search(text.lower()):
+            if BENT.search(re.sub(r"[\s_.-]+", " ", text.lower())) or not BENT_WHOLE.isdisjoint((name, value)):
                 raise InputError.of(lens, expected=READ, got=text, fix="calibrate the camera with this model")
-            if OTHER.search(text.lower()) or (name == "distortionmodel" and words[0].lower() not in MODELS):
+            if OTHER.search(text.lower()) or (name == "distortionmodel" and value not in MODELS):
                 other = text
         raw = [word for name in (*DISTORTION, *COEFFICIENTS) for words in self.words.get(name, []) for word in words]
         if other and any(word.strip("+-0.e") for word in raw):

@@ -50,7 +50,8 @@ def is_urdf(path: Path) -> bool:
     """Whether a file is meant as a URDF."""
     if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
         return True
-    return read_regular(path, "robot's description", LARGEST_FILE).lstrip()[:1] == b"<"
+    text = read_regular(path, "robot's description", LARGEST_FILE)
+    return text.lstrip(b"\xef\xbb\xbf\xff\xfe\0 \t\r\n\v\f")[:1] == b"<"  # of any encoding, behind its mark
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:

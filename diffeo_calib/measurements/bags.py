@@ -31,6 +31,8 @@ _Rows = list[list[float]]
 """Times, s, each with values."""
 _Edge = tuple[str, str]
 """Parent and child of a transform."""
+LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
+"""The larger of these, s and median intervals, is the longest time between messages across which is interpolated."""
 
 
 def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], Recording]:
@@ -103,8 +105,18 @@ def _joined(states: Mapping[str, _Rows], wanted: list[str], topic: str) -> tuple
     first, last = (edge(spans[name][k] for name in names) if names else 0.0 for k, edge in enumerate((max, min)))
     most = max((states[name] for name in names), key=len, default=[])
     times: Array = np.array(sorted(time for time, _ in most if first <= time <= last))
+    for name in names:
+        own: Array = np.array(sorted(time for time, _ in states[name]))
+        times = times[_near(times, own)] if len(own) > 1 else times
     parts = [np.interp(times, *np.array(sorted(states[name])).T) for name in names]
     return _recording(np.column_stack([times, *parts]).tolist(), topic), names
+
+
+def _near(times: Array, own: Array) -> Array:
+    """Which times have one of a part, in order, within the gap across which it is interpolated."""
+    limit = max(LONGEST_GAP_S, LONGEST_GAP * float(np.median(np.diff(own))))
+    after = np.searchsorted(own, times).clip(1, len(own) - 1)
+    return np.minimum(abs(times - own[after - 1]), abs(own[after] - times)) <= limit
 
 
 def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str, topic: str) -> Recording:
@@ -121,6 +133,8 @@ def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str,
     first, last = max(one.times[0] for one in tables.values()), min(one.times[-1] for one in tables.values())
     times = min((one.times for one in tables.values()), key=len)
     times = times[(times >= first) & (times <= last)]
+    for one in tables.values():
+        times = times[_near(times, one.times)]
     whole = torch.eye(4, dtype=torch.float64, device=HOST)
     for edge, forward in paths[0]:
         own = np.tile(edges[edge][-1][1:], (len(times), 1)) if edge not in tables else tables[edge].at(times)

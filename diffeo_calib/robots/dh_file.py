@@ -35,14 +35,21 @@ TEXTS = {
     "name": "joint name jointname frame link axis i no",
     "kind": "type kind jointtype sigma",
     "unread": "mimic x y z roll pitch yaw",
+    "convention": "convention dhconvention",
 }
 KINDS = {
     **dict.fromkeys(("revolute", "r", "rotary", "rotational", "continuous", "0"), "revolute"),
     **dict.fromkeys(("prismatic", "p", "linear", "slide", "translational", "1"), "prismatic"),
 }
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "rad": 1.0, "deg": pi / 180}
-WORDS = {"standard": "standard|classic|classical|distal|sdh", "craig": "craig|modified|proximal|mdh"}
-"""Words of a file, or of its name, that say its convention."""
+WORDS = {"standard": "classic|classical|sdh", "craig": "craig|mdh"}
+"""Words of a file's comments, or of its name, that say its convention."""
+USUAL = {
+    "standard": r"standard(?!\W+dev)|distal",
+    "craig": r"(?<!last )(?<!was )modified(?!\s*(?:on|by|at|:|\d))|proximal",
+}
+"""Words with other meanings: they count as the cell of a column, as all of a comment, or beside these:"""
+TOPIC = "dh|denavit|conventions?|parameters?"
 PLAIN = str.maketrans({"α": "alpha", "θ": "theta", "ϑ": "theta", "β": "beta", "π": "pi", "−": "-", "$": "", "\\": ""})
 UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
 INDEXED = re.compile(r"(a|alpha|d|theta)[_ ]*[{(]?\s*(?:[ijkn](\s*-\s*1)?|(prev)\w*)\s*[})]?")
@@ -62,6 +69,7 @@ class DHFile:
     Args:
         path: the file. names: of the joints. rows: their parameters [m, rad].
         convention: "standard" or "craig", empty if the file does not say it. units: how it was read, in words.
+        sure: whether words without another meaning say the convention.
     """
 
     path: Path
@@ -69,20 +77,20 @@ class DHFile:
     rows: list[DHRow]
     convention: str
     units: str
+    sure: bool = True
 
     @classmethod
     def read(cls, path: Path) -> DHFile:
         """Read a file; columns that say no unit have that with which the robot has the size of one, and right angles.
 
         Raises:
-            RobotError: no such table, a cell that is no number, no unit of angles, or two conventions.
+            RobotError: no such table, a cell that is no number, no unit of angles or limits, or two conventions.
         """
         text = read_regular(path, "robot's description", LARGEST_FILE, RobotError).decode("utf-8-sig", "replace")
-        lines = [line.strip() for line in text.translate(PLAIN).splitlines() if line.strip()]
-        header, cells = _cells(path, lines)
-        rows = [dict(zip(map(_what, header), row, strict=True)) for row in cells]
-        said = {way for way, words in WORDS.items() if _mention([path.stem, *lines], words)}
-        said |= {"craig" for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
+        lines = [line.strip() for line in text.translate(PLAIN).splitlines() if line.strip(" \t-:|+")]
+        header, cells, notes = _cells(path, lines)
+        rows = [_named(list(map(_what, header)), row) for row in cells]
+        said, sure = _conventions(header, rows, [path.stem, *notes])
         if len(said) > 1:
             raise RobotError.of(
                 f"'{path}' names two conventions", expected="standard or craig (modified), in one place"
@@ -92,11 +100,12 @@ class DHFile:
         if not units["alpha"] or not units["theta"]:
             what, fix = f"the unit of angles of '{path}'", "write it into the header: alpha [deg], theta [deg]"
             raise RobotError.of(what, expected="rad or deg", got="numbers that may be either", fix=fix)
+        units |= _units_of_values(path, rows, units)
         names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
         names = [f"joint_{name}" if name.isdecimal() else name for name in names]
         table = [_row(row, units, f"joint '{shown(name)}' of '{path}'") for name, row in zip(names, rows, strict=True)]
         words = f"lengths in {units['a']}, angles in {units['alpha']}" + ", by size" * (not {"a", "alpha"} <= set(own))
-        return cls(path, names, table, "".join(said), words)
+        return cls(path, names, table, "".join(said), words, sure)
 
     def chain(self, convention: str | None = None, tip: str | None = None) -> Chain:
         """The robot from "base" to "tip", or up to a joint.
@@ -107,7 +116,7 @@ class DHFile:
         Raises:
             RobotError: no convention, or another one than that of the file; no such joint.
         """
-        way = self.convention or convention
+        way = (self.convention if self.sure else convention or self.convention) or convention
         if not way or convention not in (None, way):
             what, fix = (
                 f"the convention of '{self.path}'",
@@ -124,8 +133,8 @@ class DHFile:
         return Chain(found.name, found.base, tip or found.tip, found.joints)
 
 
-def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """The header and the cells of every joint."""
+def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]], list[str]]:
+    """The header, the cells of every joint, and all other lines."""
     seps = [max(",;\t|", key=line.count) for line in lines]
     headers = [_split(line.lstrip("#%/ "), sep) for line, sep in zip(lines, seps, strict=True)]
     top = next((k for k, header in enumerate(headers) if {"a", "alpha", "d"} <= set(map(_what, header))), None)
@@ -138,7 +147,13 @@ def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]]
     if bad is not None or not cells:
         expected, got = f"rows of {len(headers[top])} cells, one column of each kind", few(bad or ["no row"], 20)
         raise RobotError.of(f"the DH table '{path}'", expected=expected, got=got, fix="repair this line")
-    return headers[top], cells
+    return headers[top], cells, [line for k, line in enumerate(lines) if k < top or line[0] in "#%/"]
+
+
+def _named(header: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
+    """Cells by what they hold; those of all columns that are not read as one."""
+    whole = list(zip(header, cells, strict=True))
+    return dict(whole) | {"unread": " ".join(cell for what, cell in whole if what == "unread" and cell)}
 
 
 def _split(line: str, sep: str) -> list[str]:
@@ -158,6 +173,19 @@ def _what(cell: str) -> str:
     return next((what for what, names in (NUMBERS | TEXTS).items() if letters in names.split()), "")
 
 
+def _conventions(
+    header: Sequence[str], rows: Sequence[Mapping[str, str]], notes: Sequence[str]
+) -> tuple[set[str], bool]:
+    """The conventions that a file names in its header, cells and other lines; whether by words with one meaning."""
+    said = {"craig" for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
+    cells = [row.get("convention", "") for row in rows]
+    said |= {way for way, words in WORDS.items() if _mention([*cells, *notes], words) or _mention(cells, USUAL[way])}
+    if said:
+        return said, True
+    about = [line for line in notes if _mention([line], TOPIC) or len(re.findall(r"[^\W_]+", line)) == 1]
+    return {way for way, words in USUAL.items() if _mention(about, words)}, False
+
+
 def _mention(lines: Sequence[str], words: str) -> bool:
     return any(re.search(f"(?<![a-z])({words})(?![a-z])", line, re.IGNORECASE) for line in lines)
 
@@ -170,7 +198,7 @@ def _likely_units(rows: Sequence[Mapping[str, str]]) -> dict[str, str]:
         length = min(abs(sum(d)), max(map(abs, d)))
     angles, texts = [*map(abs, alpha + theta)], " ".join(row.get(k, "") for row in rows for k in ("alpha", "theta"))
     angle = "" if any(angles) else "rad"
-    if "pi" in texts or any(abs(value - turn) < RIGHT_ANGLE_RAD for value in angles for turn in (pi / 2, pi)):
+    if "pi" in texts.lower() or any(abs(value - turn) < RIGHT_ANGLE_RAD for value in angles for turn in (pi / 2, pi)):
         angle = "rad"
     if "°" in texts or max(angles) > LARGEST_ANGLE_RAD:
         angle = "deg"
@@ -178,10 +206,40 @@ def _likely_units(rows: Sequence[Mapping[str, str]]) -> dict[str, str]:
     return lengths | dict.fromkeys(("alpha", "theta", "beta"), angle)
 
 
+def _units_of_values(path: Path, rows: Sequence[Mapping[str, str]], units: Mapping[str, str]) -> dict[str, str]:
+    """Units of limits and of offsets of joints that turn, where the header has none: by their own size.
+
+    Raises:
+        RobotError: small ones beside angles in degrees, which may be either.
+    """
+    found = dict[str, str]()
+    for names in (("lower", "upper"), ("offset",)):
+        turning = [row for row in rows if _kind(row) == "revolute"]
+        cells = [(row, name) for row in turning for name in names if "pi" not in row.get(name, "").lower()]
+        sizes = [size for row, name in cells if isfinite(size := abs(_number(row, name))) and size]
+        stated = next((units[name] for name in names if name in units), "")
+        if stated or not sizes:
+            found |= dict.fromkeys(names, stated) if stated else {}
+            continue
+        unit = "deg" if max(sizes) > LARGEST_ANGLE_RAD else "rad"
+        right = any(abs(size - turn) < RIGHT_ANGLE_RAD for size in sizes for turn in (pi / 2, pi))
+        if unit == "rad" and units["theta"] == "deg" and not right:
+            column, got = "min" if len(names) > 1 else "offset", f"at most {max(sizes):g}, with angles in deg"
+            fix = f"write {column} [rad] or {column} [deg]"
+            raise RobotError.of(f"the unit of `{column}` of '{path}'", expected="rad or deg", got=got, fix=fix)
+        found |= dict.fromkeys(names, unit)
+    return found
+
+
+def _kind(row: Mapping[str, str]) -> str:
+    """Of a joint; empty if its name is unknown."""
+    slides = VALUE.search(re.sub(r"\s", "", row["d"].lower())) is not None
+    return KINDS.get(row.get("kind", "").lower() or ("p" if slides else "r"), "")
+
+
 def _row(row: Mapping[str, str], units: Mapping[str, str], what: str) -> DHRow:
     """The parameters of a joint."""
-    slides = VALUE.search(row["d"].lower()) is not None
-    kind = KINDS.get(row.get("kind", "").lower() or ("p" if slides else "r"), "")
+    kind = _kind(row)
     value = {name: _number(row, name) for name in NUMBERS}
     wrong = [name for name in NUMBERS if not isfinite(value[name])] + ["kind"] * (not kind)
     wrong += ["unread"] * bool(row.get("unread"))  # of tables that `export` writes
@@ -190,7 +248,10 @@ def _row(row: Mapping[str, str], units: Mapping[str, str], what: str) -> DHRow:
         raise RobotError.of(what, expected=expected, got=shown(got), fix="correct the cell, or pass a URDF")
     own = "d" if kind == "prismatic" else "theta"
     for name in NUMBERS:
-        value[name] *= 1.0 if "pi" in row.get(name, "") else UNITS[units.get(name) or units[own]]
+        unit = units.get(name) or units[own]
+        if name in ("offset", "lower", "upper") and own == "d" and unit in ("rad", "deg"):
+            unit = units["d"]  # that of the joints that turn
+        value[name] *= 1.0 if "pi" in row.get(name, "").lower() else UNITS[unit]
     value[own] += value.pop("offset")
     value |= {name: end for name, end in (("lower", -inf), ("upper", inf)) if not row.get(name)}
     return DHRow(kind=kind, **value)

@@ -125,6 +125,7 @@ def test_another_layout_is_refused_and_named(real: str, said: str) -> None:
     with pytest.raises(InputError, match=r"no plane explains, by \d+\.\d px|got none"):
         Board.of(said).corners(image)
     assert other_layout([image], Board.of(said)) == real
+    assert other_layout([image], Board.of(real)) is None
     own = Board.of(real)
     numbers, pixels = own.corners(image)
     assert len(numbers) == len(own.points)

@@ -196,6 +196,10 @@ LENSES = {
     f"<Distortion_Coefficients><data>\n{FIVE}</data></Distortion_Coefficients></opencv_storage>".replace(",", ""),
     "plain": "fx: 500\nfy: 510\ncx: 310\ncy: 235\nk1: -0.1  # of a fit\nk2: 0.02\np1: 0.001\np2: -0.0002\n"
     "width: 640\nheight: 480",
+    "another spelling": ECHO.format("Plumb Bob", FIVE)
+    + "fisheye: False\nsensor: OmniVision [OV\nmodel: DS-2CD2043\n".replace("[", "# ["),
+    "JSON of intrinsics": '{"image_size":[640,480],"intrinsics":[{"fx":500.0,"fy":510.0,"cx":310,"cy":235}],'
+    '"distortion_model":"brown-conrady","coeffs":[' + FIVE + "]}",
     "JSON": '{"width":640,"height":480,"fx":500.0,"fy":510.0,"ppx":310,"ppy":235,"model":"brown","coeffs":['
     + FIVE
     + "]}",

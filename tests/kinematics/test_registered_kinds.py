@@ -67,13 +67,12 @@ def test_a_regressor_scores_positions(kind: Kind) -> None:
 
 def test_a_model_is_not_more_accurate_than_readings_are_near(kind: Kind) -> None:
     """Readings alone are no accuracy; large errors of these are no good model either."""
-    nothing = torch.zeros(len(kind.new), dtype=torch.bool)
     q = kind.new.q.clone()
     for off, expected in ((0.0, kind.result.expected.workspace), (0.01, None)):
         q[:, 2] += off
         rows = with_attributes(kind.new, q=q)
         found = residuals(kind.model, place(kind.model, rows), rows)
-        worst = accuracy(kind.model, found, nothing, "m")
+        worst = accuracy(kind.model, found.values(), "m")
         assert worst.value == pytest.approx(found.main.rms if expected is None else expected)
 
 

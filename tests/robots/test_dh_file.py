@@ -122,6 +122,27 @@ def test_what_a_file_says_of_its_convention(text: str, convention: str, tmp_path
             table.chain()
 
 
+@pytest.mark.parametrize(
+    "text", ["# last modified: 2024", "# with the standard deviation of parameters", "# a standard"]
+)
+def test_words_with_another_meaning_are_no_convention(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "ur10_modified.csv"
+    path.write_text(lines(",", "joint,theta,d,a,alpha", [["index_proximal", 0, 1, 0.2, 1.5708]], text))
+    assert not DHFile.read(path).convention
+    path.write_text(f"# modified\n{path.read_text()}")
+    table = DHFile.read(path)
+    assert table.convention == "craig"
+    assert table.chain("standard").n == table.chain().n == 1
+
+
+def test_cells_of_slides_limits_and_tables_in_text(tmp_path: Path) -> None:
+    rows = [["0", "PI/2", "q1 + 0.15", "0", "0", "0.5"], ["0", "-PI/2", "0", "0", "-170", "170"]]
+    (tmp_path / "arm.md").write_text(lines("|", "a|alpha|d|theta|min|max", [["---", ":-:", "-", "-", "-", "-"], *rows]))
+    chain = DHFile.read(tmp_path / "arm.md").chain("standard")
+    assert chain.kinds == ("prismatic", "revolute")
+    torch.testing.assert_close(chain.limits[:, 1], torch.tensor([0.5, 170 * pi / 180], dtype=torch.float64))
+
+
 def test_limits_and_a_tip_before_the_last_row(tmp_path: Path) -> None:
     rows = [[r.a, r.alpha, r.d, r.theta, *((-3, 2.5) if k == 0 else ("", ""))] for k, r in enumerate(ROWS)]
     (tmp_path / "arm.csv").write_text(lines(",", "a,alpha,d,theta,min,max", rows))
@@ -150,7 +171,8 @@ def test_limits_and_a_tip_before_the_last_row(tmp_path: Path) -> None:
             "a,alpha,d,theta\n0.3,0.4,0,0\n",
             "the unit of angles of .*: expected rad or deg, got numbers that may be either",
         ),
-        ("# standard, not modified\na,alpha,d,theta\n0,1.5708,0,0\n", "names two conventions"),
+        ("a,alpha,d,theta,min,max\n0,90,0,0,-3,3\n", r"unit of `min` of .*write min \[rad\] or min \[deg\]"),
+        ("# standard DH, not modified\na,alpha,d,theta\n0,1.5708,0,0\n", "names two conventions"),
     ],
 )
 def test_broken_files_are_one_error(text: str, message: str, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.expected_errors import expected_errors
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.calibration.judgement import Accuracy, accuracy, block_text, judge, steps_of
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -27,8 +27,10 @@ from diffeo_calib.kinematics.evaluation import (
     positions_of,
     residuals,
     rows_used_in_fit,
+    some_rows,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
+from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -38,6 +40,7 @@ from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -198,9 +201,11 @@ def find(
     rows = FitRows(model, measured)
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
-    if data is not None and (bool(unseen(model, data.q).any()) or not rows.of_positions):
+    new = None if data is None else _new_rows(model, data, rows)
+    if data is not None and new is not None and (bool(new.any()) or not rows.of_positions):
         aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
-        shown = _of_table(model, data, measured, own, _errors(data, aligned, kinematics, own, places))
+        errors = _errors(data, aligned, kinematics, own, places)
+        shown = _of_table(model, data, new, measured, own, every=errors)
     elif rows.of_positions:
         shown = _left_out(model, rows, kinematics)
     else:
@@ -263,27 +268,61 @@ def _errors(
     return found | {last: residuals(stages[last], own, data)}
 
 
+def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
+    """(N,) which rows took no part in the fit, nor in a registration: those of other kinds than its rows never did."""
+    new = unseen(model, data.q)
+    if rows.of_positions and model.registration is None:
+        other = torch.ones_like(new)
+        own = divided(data)[0]
+        seen = None if own is None else measured_rows(own.table)
+        if own is not None and seen is not None:
+            other[own.rows[seen.rows].to(HOST)] = False
+        new |= other
+    return new
+
+
 def _of_table(
-    model: CalibratedKinematics, data: Any, measured: Measurements | None, own: Places, every: Mapping[str, Evaluations]
+    model: CalibratedKinematics,
+    data: Any,
+    mask: Tensor,
+    measured: Measurements | None,
+    own: Places,
+    *,
+    every: Mapping[str, Evaluations],
 ) -> Shown:
     """Rows that the model has not seen; if there are none, all as fitted.
 
     Args:
-        measured: their positions in the frame of the model. own: places of the devices. every: errors of all by stage.
+        mask: (N,) which rows are new. measured: positions of all in the frame of the model.
+        own: places of the devices. every: errors of all by stage.
     """
-    mask = unseen(model, data.q)
     new = bool(mask.any())
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
     errors = {name: found.rows(mask) for name, found in every.items()}
     shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
-    seen = None if measured is None or not new else unseen(model, measured.q)
-    if measured is None or seen is None or not bool(seen.any()):
+    raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
+    if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
-    judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
-    moved = judged.causes if judged.refusal is None else [judged.refusal]
+    moved = _causes(model, own, data.rows(mask), list(errors.values())[-1])
     predictions = Predictions.of(model, measured.rows(seen))
     return shown._replace(predictions=predictions, outliers=predictions.outliers(model), moved=moved)
+
+
+def _causes(model: CalibratedKinematics, own: Places, data: Any, found: Evaluations) -> Sequence[str]:
+    """What happened to new rows.
+
+    Raises:
+        MeasurementError: another reading explains impossible errors. Something that moved is told, not raised.
+    """
+    try:
+        judged = judge(model, own, data, found)
+    except MeasurementError as error:
+        seen = positions_of(model, own, data)
+        if seen is None or not motions(model, some_rows(seen)):
+            raise
+        return [str(error)]
+    return judged.causes if judged.refusal is None else [judged.refusal]
 
 
 def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, Kinematics]) -> Shown:

@@ -106,7 +106,9 @@ def how_good(found: Findings) -> Section:
     pictures = [
         picture
         for number, stages in enumerate(found.kinds.values())
-        for picture in stage_pictures(stages, f"-{number}", limit)
+        for picture in stage_pictures(
+            stages, f"-{number}", limit if next(iter(stages.values())).what == ERRORS else None
+        )
     ]
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
