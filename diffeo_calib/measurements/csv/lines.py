@@ -173,10 +173,12 @@ class CsvLines:
         except IsADirectoryError as error:
             fix = f"of images of a board run `diffeo-calib images '{self.path}' JOINTS.csv ...`, and pass its table"
             raise MeasurementError.of(f"'{self.path}' is a folder", expected="a table", fix=fix) from error
-        except OSError as error:
-            what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+        except FileNotFoundError as error:
             fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-            raise MeasurementError.of(f"file '{self.path}' {what}", fix=fix) from error
+            raise MeasurementError.of(f"file '{self.path}' does not exist", fix=fix) from error
+        except OSError as error:
+            what = f"file '{self.path}' cannot be read ({error.strerror})"
+            raise MeasurementError.of(what, fix="pass the name of a readable file") from error
 
     def _no_row(self, cells: Sequence[str]) -> bool:
         """Whether a line below the header is a comment, empty, or the header again."""
