@@ -191,4 +191,4 @@ def test_command_line(command: Command, tmp_path: Path) -> None:
     table.write_text("\n".join(wrong))
     done = command("fit", table, *chain, *options, "-o", model)
     assert done.code == 0
-    assert "no marker was seen in line 4: 1 row(s) left out" in done.error
+    assert "no marker was seen in line 4: 1 row(s) left out" in done.err

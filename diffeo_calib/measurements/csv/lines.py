@@ -175,7 +175,8 @@ class CsvLines:
             raise MeasurementError.of(f"'{self.path}' is a folder", expected="a table", fix=fix) from error
         except FileNotFoundError as error:
             fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-            raise MeasurementError.of(f"file '{self.path}' does not exist", fix=fix) from error
+            path = self.path
+            raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
         except OSError as error:
             what = f"file '{self.path}' cannot be read ({error.strerror})"
             raise MeasurementError.of(what, fix="pass the name of a readable file") from error
