@@ -35,7 +35,7 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
     ("options", "words"),
     [
         (["--length", "m"], "1000 times too large: check their unit (--length)"),
-        (["--joints", "q2,q1"], "the rows fit with --joints '{q1},{q2},"),
+        (["--joints", "q2,q1"], "the rows fit with --joints 'q1,q2,"),
         (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
     ],
 )

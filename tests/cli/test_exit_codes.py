@@ -22,7 +22,7 @@ from diffeo_calib.measurements.table_format import TableFormat
         ["fit"],
         ["fit", "t.csv", "--robot", "r.urdf"],
         ["nonsense"],
-        ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "inch", "--angle", "rad"],
+        ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "km", "--angle", "rad"],
         ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "m", "--angle", "rad", "--surprise"],
         ["fit", "t.csv", "--holdout", "1.5"],
         ["fit", "t.csv", "--holdout", "nan"],

@@ -69,6 +69,6 @@ def test_a_device_without_line_ends(small_site: Site, command: Command, tmp_path
 
 
 def test_a_unit_that_does_not_exist(small_site: Site, command: Command, tmp_path: Path) -> None:
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--length", "cm"))
+    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--length", "km"))
     assert done.code == 2
-    assert "Invalid value for '--length': 'cm' is not one of 'm', 'mm'." in done.err
+    assert "Invalid value for '--length': 'km' is not one of 'm', 'mm', 'cm', 'inch'." in done.err

@@ -61,7 +61,7 @@ def without_distances(kind: Kind) -> Any:
 MISTAKES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "seem to be radians that were converted": lambda q: q * math.pi / 180,
     "seem to be degrees": lambda q: q * 180 / math.pi,
-    "with joints=.waist_joint,.elbow_joint.,.shoulder_joint.,forearm_roll_joint,": lambda q: q[:, [0, 2, 1, 3, 4, 5]],
+    "with joints=.waist_joint,elbow_joint,shoulder_joint,forearm_roll_joint,": lambda q: q[:, [0, 2, 1, 3, 4, 5]],
 }
 
 

@@ -224,6 +224,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
         fix = f"no column is named after {missing}: name the columns as the joints, or q1, q2, ... in their order"
         got = few(sheet.numbers, 20)
         raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=got, fix=fix)
+    arms = [arm for arm in arms if arm.how == "named as in the URDF"] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
