@@ -109,13 +109,26 @@ def test_nothing_is_proposed_for_a_right_table_of_a_wrong_robot() -> None:
             lambda q: q * (4096 / 360),
             "360/4096*{a},360/4096*{b},360/4096*{c},360/4096*{d},360/4096*{e},360/4096*{f},360/4096*{g}",
         ),
+        (
+            lambda q: (q + math.pi) * (4096 / 360),
+            "360/4096*{a},360/4096*{b}+180,360/4096*{c}+180,360/4096*{d}+180,360/4096*{e}+180,360/4096*{f}+180,"
+            "360/4096*{g}",
+        ),
         (lambda q: q * torch.tensor([1, 1, 1, 100, 1, 1, 1]), "a,b,c,1/100*{d},e,f,g"),
-        (lambda q: q[:, [0, 1, 2, 5, 4, 3, 6]], "a,b,c,{f},e,{d},g"),
+        (lambda q: q[:, [0, 1, 2, 5, 4, 3, 6]], "a,b,c,f,e,d,g"),
     ],
 )
 def test_a_seven_axis_arm(meant: object, texts: str) -> None:
     q, points = measured(SEVEN)
     assert texts in found(SEVEN, meant(q), points)  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.slow
+def test_shares_of_the_limits_that_look_like_degrees() -> None:
+    """-100..100; the factor of the last joint trades with the robot's errors of several mm."""
+    q, points = measured(SEVEN)
+    (text,) = found(SEVEN, q / torch.tensor([2.9, 2.0, 2.9, 2.0, 2.9, 2.0, 3.0]) * math.radians(100.0), points)
+    assert text.startswith("1.66158*{a},1.14592*{b},1.66158*{c},1.14592*{d},1.66158*{e},1.14592*{f},1.7")
 
 
 @pytest.mark.slow

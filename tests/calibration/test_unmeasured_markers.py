@@ -10,9 +10,11 @@ import torch
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.unmeasured_markers import check_markers, unmeasured_markers
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 ARM = SimulatedArm(seed=5, markers=2)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def rows(count: int = 40) -> dc.Measurements:
@@ -54,6 +56,26 @@ def test_places_of_almost_the_nominal_robot_are_doubted() -> None:
     data = with_second(wished(4, reached=3e-5))
     with pytest.warns(DiffeoCalibWarning, match="marker 1 follows the nominal robot"):
         check_markers(ARM.nominal, data)
+
+
+def test_a_marker_that_is_near_the_nominal_robot_is_measured_where_the_other_one_does_not_belong() -> None:
+    """A robot with errors of micrometres, and a marker that is not on its tip: no proof against the first."""
+    data = with_second(wished(4, reached=3e-5))
+    elsewhere = ARM.nominal(data.q.roll(1, 0))[:, :3, 3]
+    points = torch.stack([elsewhere, data.points[:, 1]], 1)
+    assert not list(unmeasured_markers(ARM.nominal, dc.Measurements(data.q, points, data.joint_names)))
+
+
+def test_markers_above_each_other_on_a_robot_that_turns_about_one_axis_are_two() -> None:
+    joints = [
+        Joint(f"j{k}", "revolute", torch.eye(4, dtype=torch.float64), UP, lower=-2.0, upper=2.0) for k in range(2)
+    ]
+    joints[1].origin[0, 3] = 0.4
+    robot, shift = dc.Chain("planar", "base", "tip", joints), torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    q = 4.0 * torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
+    poses = robot(q)
+    first = poses[:, :3, 3] + 0.3 * poses[:, :3, 0] + 1e-3 * torch.sin(q[:, :1])
+    assert not list(unmeasured_markers(robot, dc.Measurements(q, torch.stack([first, first + shift], 1))))
 
 
 def test_copies_are_refused_also_shifted_ones() -> None:

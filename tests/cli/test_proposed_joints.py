@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import pytest
-import tomllib
 import torch
 from command_bank import Command
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 LIFT = """<robot name="lift"><link name="floor"/>
 <joint name="up" type="prismatic"><parent link="floor"/><child link="a"/><axis xyz="0 0 1"/>
@@ -62,6 +67,36 @@ def test_units(factors: tuple[float, float, float], written: dict[str, str], tmp
     found = proposed(command, tmp_path, urdf, ("up", "one", "two"), cells)
     assert {name: found[name] for name in ("length", "angle", "joint-length") if name in found} == written
     assert found["joints"] == "up,one,two"
+
+
+def test_a_short_slide_in_another_unit_is_no_error_of_the_robot(tmp_path: Path, command: Command) -> None:
+    """Read in mm it seems to stand still, and the rest explains the rows nearly as well."""
+    urdf, q, _ = lift(tmp_path)
+    q[:, 0] *= 0.08
+    points = dc.load_urdf(urdf)(q)[:, :3, 3] + 0.3
+    found = proposed(command, tmp_path, urdf, ("up", "one", "two"), torch.cat([q, 1e3 * points], 1))
+    assert [found[name] for name in ("length", "angle", "joint-length")] == ["mm", "rad", "m"]
+
+
+def test_a_sign_where_the_file_states_its_units(tmp_path: Path, command: Command) -> None:
+    urdf, q, points = lift(tmp_path)
+    q[:, 2] *= -1
+    found = proposed(command, tmp_path, urdf, ("up", "one [rad]", "two [rad]"), torch.cat([q, points], 1))
+    assert found["joints"] == "up,one [rad],-{two [rad]}"
+
+
+def test_the_size_of_a_gantry_follows_from_its_limits(tmp_path: Path, command: Command) -> None:
+    link = '<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>'
+    link += '<limit lower="0" upper="1" effort="1" velocity="1"/></joint><link name="{2}"/>'
+    axes = ("x1", "a", "b", "1 0 0"), ("y1", "b", "c", "0 1 0"), ("z1", "c", "d", "0 0 1")
+    urdf = tmp_path / "gantry.urdf"
+    urdf.write_text(f'<robot name="g"><link name="a"/>{"".join(link.format(*axis) for axis in axes)}</robot>')
+    q = torch.rand(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    for length, per_metre in (("m", 1.0), ("mm", 1e3)):
+        cells = per_metre * torch.cat([q, 0.999 * q + 0.3], 1)
+        found = proposed(command, tmp_path, urdf, ("x1", "y1", "z1"), cells)
+        assert found["length"] == length
+        assert "limits of the joints" in str(found["text"])
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ CLEAR_RATIO = 5.0
 """A reading is clear if every other one's residual is larger by this."""
 DOUBTFUL = 0.01
 """Share of what the rows vary, left by the best units, above which other meanings of the joints are sought."""
+SMALLEST_PART = 0.1
+"""Of a joint's limits that a table passes through, in the right unit."""
 NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
@@ -277,6 +279,10 @@ def _units(source: Source) -> Iterator[Choice]:
     if not all(source.robot.periodic) and doubtful:
         others = sorted([*found, *_left(source, lengths, lengths, boards=boards)], key=lambda entry: entry[0])
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
+    if by_limits := not any(source.robot.periodic) and [
+        (left, key) for left, key in found if left < inf and _within(source, key)
+    ]:
+        found = by_limits  # all lengths in another unit are another size, which the rows do not show
     (best, (length, angle, slides, camera)), *others = found
     excluded = found[-1][0] == inf
     named = [
@@ -307,12 +313,24 @@ def _units(source: Source) -> Iterator[Choice]:
         return
     why = source.words(best, others[0][0] if others else inf)
     why += ", by the names of the columns: the numbers leave it open" * by_names
+    why += ", by the limits of the joints: the numbers leave it open" * bool(by_limits)
     yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
     yield Choice("angle", angle, why if no_length else "the same")
     if slides:
         yield Choice("joint-length", slides, "the same: the slides are in another unit")
     if camera:
         yield Choice("camera-on-tool", True, "the same; else the board is on the tool")
+
+
+def _within(source: Source, key: tuple[Any, ...]) -> bool:
+    """Whether values of joints in some units lie within the limits, in more than a small part of these."""
+    table = replace(source.table, length=key[0], angle=key[1], joint_length=key[2])
+    q, (low, high) = (
+        read_joints(source.csv, source.joints, table, kinds=source.robot.kinds),
+        source.robot.limits.unbind(1),
+    )
+    part = (q.amax(0) - q.amin(0)) / (high - low)
+    return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 
 
 def _left(source: Source, lengths: list[str], slides: list[Any], *, boards: bool) -> list[tuple[float, Any]]:
