@@ -124,6 +124,17 @@ def test_a_seven_axis_arm(meant: object, texts: str) -> None:
 
 
 @pytest.mark.slow
+def test_one_zero_of_all_joints_is_plainer_than_signs() -> None:
+    """Of ticks that count half a turn at zero; a spherical wrist could count the other way instead."""
+    arm = SimulatedArm(seed=1)
+    q, points = arm.measure(40, seed=2)
+    data = dc.Measurements((q + math.pi) * 4096 / 360, points, doubt=False)
+    (one,) = conventions_of(arm.nominal, data, "deg")
+    texts = one.texts(list("abcdef"), "deg", 1.0)
+    assert texts == ["360/4096*{a}", *(f"360/4096*{{{name}}}+180" for name in "bcde"), "360/4096*{f}"]
+
+
+@pytest.mark.slow
 def test_shares_of_the_limits_that_look_like_degrees() -> None:
     """-100..100; the factor of the last joint trades with the robot's errors of several mm."""
     q, points = measured(SEVEN)

@@ -109,6 +109,16 @@ def test_poses_as_sixteen_numbers(by_rows: bool, proposed: Proposed) -> None:
     assert written["convention"] == "matrix"
 
 
+def test_a_pose_keeps_the_last_joint_though_its_place_does_not_move(proposed: Proposed) -> None:
+    q = rows()[0]
+    q[:, 5] *= 0.1
+    poses = ARM.nominal(q.deg2rad())
+    poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
+    written, _ = proposed((JOINTS, q), ([f"T{row}{k}" for row in range(3) for k in range(4)], poses[:, :3].flatten(1)))
+    assert written["joints"] == ",".join(JOINTS)
+    assert written["convention"] == "matrix"
+
+
 def test_units_of_names_that_the_numbers_contradict(proposed: Proposed) -> None:
     q, points = rows()
     _, text = proposed(([f"{name} [rad]" for name in JOINTS], q), (["x [mm]", "y [mm]", "z [mm]"], points))
