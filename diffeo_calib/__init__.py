@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from diffeo_calib.process.scales import Hyperparameters
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
+    from diffeo_calib.robots.cartesian import cartesian, pose_inputs
     from diffeo_calib.robots.dh import DHRow, from_dh
     from diffeo_calib.robots.tree import Chain, Tree
     from diffeo_calib.robots.urdf import load_urdf
@@ -95,6 +96,7 @@ __all__ = [
     "VonMises",
     "calibrate",
     "candidates",
+    "cartesian",
     "compare",
     "compensate",
     "evaluate",
@@ -104,6 +106,7 @@ __all__ = [
     "load",
     "load_urdf",
     "plan",
+    "pose_inputs",
     "read_measurements",
     "read_readings",
     "recalibrate",
@@ -147,6 +150,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "measurements.table": "Measurements",
             "reports": "plots",
             "reports.report": "write_report",
+            "robots.cartesian": "cartesian pose_inputs",
             "robots.dh": "DHRow from_dh",
             "robots.tree": "Chain Tree",
             "robots.urdf": "load_urdf",

@@ -178,12 +178,13 @@ class EvaluateOptions(Command):
 class InitOptions(Command):
     """Propose the options of `fit` for a table and a robot.
 
-    Looks at names, numbers and plausible units, and writes a campaign file with a reason for every line. Check it, then
+    Without ROBOT the table has poses, or places, that a machine was told in place of joint values. Looks at names,
+    numbers and plausible units, and writes a campaign file with a reason for every line. Check it, then
     run `diffeo-calib fit campaign.toml`.
     """
 
     csv: Path = argument("CSV", CSV)
-    robot: Path = argument("ROBOT", ROBOT)
+    robot: Path | None = argument("ROBOT", ROBOT, default=None)
     places: Places
     output: Path = output("Campaign file to write.", "TOML", Path("campaign.toml"))
     force: bool = option("Replace a campaign file that was edited.", default=False)
@@ -304,9 +305,14 @@ class ExportOptions(Command):
     c: Path | None = written("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
     torch: Path | None = written("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
     onnx: Path | None = written("The same for onnxruntime; needs the packages onnx and onnxscript.", "ONNX")
+    field: Path | None = written(
+        "Of a machine that is told places: what to add to its commands at the places of --grid.", "CSV"
+    )
+    grid: str = option("Points of --field along each axis.", "NXxNYxNZ", default="5x5x5")
     camera: Path | None = option(
-        "Write the camera of a model of images: intrinsics (OpenCV, ROS camera_info), hand-eye transform, URDF joint, "
-        "static transform; its place belongs to --urdf, --dh or --ur-kinematics if these are written too.",
+        "Write the camera of a model of images, or of poses of a board: intrinsics (OpenCV, ROS camera_info), hand-eye "
+        "transform (OpenCV, easy_handeye2), URDF joint, static transform; its place belongs to --urdf, --dh or "
+        "--ur-kinematics if these are written too.",
         "FOLDER",
         file="folder",
     )

@@ -10,14 +10,17 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Links, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Links, Robot, Rows, StoredUnits, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.csv.files import read_poses
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
@@ -44,6 +47,19 @@ def load_robot(path: Path, links: Links) -> Tree:
         what, expected = f"--base or --load of a DH table, '{path}'", "its whole chain, or one --tip"
         raise InputError.of(what, expected=expected, fix="leave them out, or pass a URDF")
     return DHFile.read(path).chain(links.dh_convention, *tips)
+
+
+def robot_of(given: Robot, source: MeasuredTable) -> Tree:
+    """The robot of a table: that of a file, or a machine that was told the poses of the table."""
+    if isinstance(source.joints, PoseColumns):
+        if given.robot is not None or any(vars(given.links).values()):
+            what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"
+            raise InputError.of(what, expected="joint values, or poses", got="both", fix=fix)
+        return cartesian(read_poses(source.csv, source.joints, source.table))
+    if given.robot is None:
+        expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
+        raise InputError.of("the robot", expected=expected, got="neither")
+    return load_robot(given.robot, given.links)
 
 
 def is_urdf(path: Path) -> bool:

@@ -81,6 +81,11 @@ JOINTS = (
     "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of the "
     "table, such as -{J2}+90 or {J3}+{J2}."
 )
+ROBOT_POSE = (
+    "Columns of the place or pose to which the machine was told to go, as its controller writes it, in place of joint "
+    "values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention (angles in the unit of "
+    "--angle)."
+)
 LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit of revolute joints in the table"
 
 
@@ -92,6 +97,7 @@ class StoredUnits:
     angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
     joints: str | None = option(JOINTS, "A,B,...")
+    robot_pose: str | None = option(ROBOT_POSE, "X,Y,Z[,...]")
     sep: str | None = option(f"{SEP}, {AS_STORED}.")
     decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
 
@@ -211,9 +217,9 @@ class Links:
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """Which robot was measured."""
+    """Which robot was measured; none where --robot-pose says where it was told to go."""
 
-    robot: Path = option(ROBOT, "FILE", default=...)
+    robot: Path | None = option(ROBOT, "FILE")
     links: Links
 
 

@@ -92,7 +92,7 @@ class Source:
 
     csv: Path
     robot: Tree
-    joints: list[str]
+    joints: Any
     rows: RowColumns
     table: TableFormat
     numbers: tuple[str, ...]

@@ -119,7 +119,7 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     left = [f"{few(names)}: {why}" for names, why in unmeasured]
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
-    matrix = () if markers or nameless else _matrix_in(csv, sheet, others)
+    matrix = () if markers or nameless else matrix_in(csv, sheet, others)
     markers = [others[:3]] if nameless else markers or [list(own) for own in matrix[:1]]
     readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
     if not markers and not sockets and not readings:
@@ -138,7 +138,7 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting, nine, left)
 
 
-def _matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
+def matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
     """Position and rotation, by rows, of poses that are written as 16 numbers by rows or columns; none without them."""
     found = guess_matrix(columns)
     if found is None:

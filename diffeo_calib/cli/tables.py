@@ -29,14 +29,17 @@ from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
+POSE_JOINTS = 6
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
 
@@ -80,7 +83,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     triples = _position_triples(rows.position or []) or None
     columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
-    return MeasuredTable(csv, units.joints, columns, table, duplicates)
+    return MeasuredTable(csv, joints_of(units), columns, table, duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -214,13 +217,14 @@ class MeasuredTable:
 
     Args:
         csv: the file.
-        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
+        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints; or
+            the columns of a pose.
         columns: those of what was measured, whose joints are those of the robot that reads them.
         table: the format. duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
     """
 
     csv: Path
-    joints: str | None
+    joints: str | PoseColumns | None
     columns: TableColumns
     table: TableFormat
     duplicates: str = "keep"
@@ -269,7 +273,7 @@ class ProgramTable:
     """
 
     csv: Path
-    joints: str | None
+    joints: str | PoseColumns | None
     table: TableFormat
     given: Targets
 
@@ -321,8 +325,24 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     return frame
 
 
-def joint_columns(joints: str | None, robot: Tree) -> list[str]:
-    """Names of the joint columns: those given, or the robot's."""
+def joints_of(units: StoredUnits) -> str | PoseColumns | None:
+    """The columns of the joints, or of the pose in their place, as the options name them."""
+    if units.robot_pose is None:
+        return units.joints
+    if units.joints is not None:
+        fix = "name the columns of the pose, or those of the joints"
+        raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
+    return PoseColumns.of(units.robot_pose)
+
+
+def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | PoseColumns:
+    """Names of the joint columns: those given, or the robot's; or the columns of the pose of a machine."""
+    if isinstance(joints, PoseColumns):
+        count = len(joints.columns) if not joints.convention else POSE_JOINTS
+        if not is_cartesian(robot) or robot.n != count:
+            expected = f"the {robot.n} joint values of robot '{robot.name}'"
+            raise InputError.of(f"--robot-pose {','.join(joints.columns)}", expected=expected, got="other inputs")
+        return replace(joints, robot=robot)
     if not joints:
         return list(robot.joint_names)
     names = _split_names(joints)

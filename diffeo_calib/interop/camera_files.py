@@ -16,34 +16,65 @@ FRAME = "_optical_frame"
 """A camera's frame, behind its name: x right, y down, z ahead (REP 103)."""
 
 
-def camera_files(model: CalibratedKinematics, geometry: Geometry | None = None) -> dict[str, str]:
+def camera_files(
+    model: CalibratedKinematics, geometry: Geometry | None = None, *, on_tool: bool = True
+) -> dict[str, str]:
     """Names and contents of the files; those of several cameras begin with the camera's name.
 
     Args:
-        model: of images of a board. geometry: rigid kinematics that the camera's place belongs to; the model's own by
-            default.
+        model: of images of a board, or of its poses, which tell no lens. geometry: rigid kinematics that the camera's
+            place belongs to; the model's own by default. on_tool: whether the camera is on the tool, where poses of
+            the board were measured.
 
     Raises:
         InputError: a model without such a camera, or one that was registered again.
     """
     cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
-    if not cameras:
-        fix = "calibrate with a table of `images`; poses of a board tell no lens, `fit --json` has their hand-eye"
-        raise InputError.of("the camera of the model", expected="one that saw a board in images", got="none", fix=fix)
-    on_tool = next(iter(cameras.values())).on_tool
-    found: dict[str, str] = {}
-    for name, own in HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry).items():
-        lens = cameras[name.partition("/")[0] if name not in cameras else name].camera
-        known = name.replace("/", "_")
-        files = {
-            "camera.yaml": camera_text(lens),
-            "camera_info.yaml": camera_text(lens, ros=True),
+    if not cameras and model.lever is None:
+        fix = "calibrate with a table of `images`, or with poses of a board"
+        raise InputError.of("the camera of the model", expected="one that saw a board", got="none", fix=fix)
+    on_tool = next(iter(cameras.values())).on_tool if cameras else on_tool
+    found, each = dict[str, str](), HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry)
+    for name, own in each.items():
+        known, files = name.replace("/", "_"), dict[str, str]()
+        if cameras:
+            lens = cameras[name.partition("/")[0] if name not in cameras else name].camera
+            files = {"camera.yaml": camera_text(lens), "camera_info.yaml": camera_text(lens, ros=True)}
+        files |= {
             "hand_eye.yaml": _hand_eye(own),
+            "easy_handeye2.calib": _easy_handeye(own, known, model.geometry.on[0], on_tool=on_tool),
             "camera.xacro": _joint(own, known),
             "static_transform.launch.xml": _launch(own, known),
         }
-        found |= {file if len(cameras) == 1 else f"{known}_{file}": text for file, text in files.items()}
+        found |= {file if len(each) == 1 else f"{known}_{file}": text for file, text in files.items()}
     return found
+
+
+def _easy_handeye(own: HandEye, name: str, tip: str, *, on_tool: bool) -> str:
+    """A calibration of easy_handeye2: where the camera is, on the effector or in the robot's base."""
+    base = own.board.link if on_tool else own.camera.link
+    named = {
+        "name": name,
+        "calibration_type": "eye_in_hand" if on_tool else "eye_on_base",
+        "robot_base_frame": base,
+        "robot_effector_frame": tip,
+        "tracking_base_frame": f"{name}{FRAME}",
+        "tracking_marker_frame": "board",
+    }
+    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
+    parts = {
+        "translation": zip("xyz", own.camera.pose[:3, 3].tolist(), strict=True),
+        "rotation": zip("xyzw", turn, strict=True),
+    }
+    lines = [
+        "parameters:",
+        *(f'  {key}: "{value}"' for key, value in named.items()),
+        "  freehand_robot_movement: false",
+    ]
+    lines += ["transform:"]
+    for part, numbers in parts.items():
+        lines += [f"  {part}:", *(f"    {axis}: {value!r}" for axis, value in numbers)]
+    return "\n".join([*lines, ""])
 
 
 def _hand_eye(own: HandEye) -> str:

@@ -19,13 +19,14 @@ from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
-from diffeo_calib.cli.models import load_robot
+from diffeo_calib.cli.models import robot_of
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.bags import read_bag
 from diffeo_calib.measurements.csv.files import read_joints
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.stops import rows_of, stops
 from diffeo_calib.reports.live import Page, served, state_of
 
@@ -41,7 +42,10 @@ def run(given: CampaignOptions) -> None:
         raise InputError.of("--places or --marker, of a table that grows line by line", fix=fix)
     source = measured_table(given.csv, given.rows, given.units)
     goal = parsed_length(given.target, "--target")
-    robot, played = load_robot(given.robot.robot, given.robot.links), _stops(source, given)
+    if isinstance(source.joints, PoseColumns):
+        fix = "measure with --robot and joint values, or fit the table when it is complete"
+        raise InputError.of("--robot-pose of a table that grows: the middle of all poses is not known yet", fix=fix)
+    robot, played = robot_of(given.robot, source), _stops(source, given)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:

@@ -13,7 +13,7 @@ from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns, table_format
+from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -79,7 +79,7 @@ def run(options: CorrectOptions) -> None:
     kinematics = load_laden(options.model, options.payload_mass)
     stated = as_fitted(kinematics, None, options.units)[1]
     program, output = options.program, options.output
-    source = ProgramTable(program, stated.joints, table_format(stated), options.targets)
+    source = ProgramTable(program, joints_of(stated), table_format(stated), options.targets)
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())

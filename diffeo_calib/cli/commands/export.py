@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
@@ -18,6 +19,7 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
+from diffeo_calib.interop.error_field import field_text
 from diffeo_calib.interop.files import in_unit, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
 from diffeo_calib.interop.mjcf import mjcf_text
@@ -111,11 +113,21 @@ class _Export:
 
     def camera(self, folder: Path) -> dict[Path, bytes]:
         """The files of the camera; its place belongs to the rigid kinematics, if any are written."""
-        files = camera_files(self.model, self.geometry)
+        made = self.model.provenance
+        words = [] if made is None else shlex.split(made.command or "")
+        files = camera_files(self.model, self.geometry, on_tool="--camera-on-tool" in words)
         make_folder(folder)
         belongs = "the calibrated model" if self.geometry is None else "the rigid kinematics written beside it"
         self.lines.append(f"camera: {', '.join(files)} in {folder}; its place belongs to {belongs}")
         return {folder / name: text.encode() for name, text in files.items()}
+
+    def field(self) -> None:
+        """Corrections of commands on a grid, of a machine that is told places."""
+        self.files["--field"] = field_text(self.model, self.given.grid, self.length).encode()
+        self.lines.append(
+            "field: a controller adds add_x, ... to the place that it is to reach; std_x, ... say how well"
+        )
+        self.lines.append("  each is known; between the points interpolate linearly")
 
     def tables(self) -> None:
         """Correction tables, with the nominal robot."""
@@ -142,11 +154,13 @@ def run(given: ExportOptions) -> None:
         export.offsets()
     if tables:
         export.tables()
+    if "--field" in wanted:
+        export.field()
     camera = export.camera(wanted["--camera"]) if "--camera" in wanted else {}
     texts = {} if source is None else source.contents
     write_together({wanted[option]: content for option, content in export.files.items()} | texts | camera)
     record.add(files={option[2:]: target for option, target in wanted.items()})
-    if export.files:
+    if len(export.rows) > 1:
         _show(export.model, export.rows)
     say(*export.lines, *_limits(model, rigid))
     for option in export.files:

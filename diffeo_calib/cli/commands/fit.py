@@ -17,7 +17,7 @@ from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
 from diffeo_calib.cli.declarations import FitOptions
-from diffeo_calib.cli.models import load_kinematics, load_robot, made_by_command
+from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -52,7 +52,7 @@ def run(given: FitOptions) -> None:
     source = measured_table(given.csv, given.rows, given.units, given.duplicates)
     with exit_on_interrupt(), progress_bar() as progress:
         chain, others = (
-            load_robot(given.robot.robot, given.robot.links),
+            robot_of(given.robot, source),
             [load_kinematics(path) for path in given.scales_of or ()],
         )
         data = source.read(chain, given.robot.links.tip or chain.tips)

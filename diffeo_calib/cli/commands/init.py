@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any, NamedTuple, get_args
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
-from diffeo_calib.cli import proposals
+from diffeo_calib.cli import proposals, told_poses
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
@@ -22,7 +22,7 @@ from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, rows_in, tips_of, with_places
-from diffeo_calib.common.errors import InputError, few
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
@@ -77,7 +77,7 @@ def run(given: InitOptions) -> None:
     sheet = guess_sheet(csv)
     choices = [Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])), *joined]
     try:
-        choices += _choices(csv, given.robot, output, sheet)
+        choices += _told(csv, given.robot, output, sheet) or _choices(csv, given.robot or Path(), output, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -123,6 +123,29 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
         yield from proposals.beside(replace(seen, table=_format(units, seen)), sheet)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
+
+
+def _told(csv: Path, robot: Path | None, output: Path, sheet: Sheet) -> list[Choice]:
+    """Entries of a table with poses of the machine; none where a robot is named whose joints the table has."""
+    left = list[Choice]()
+    if robot is not None:
+        try:
+            _arms(robot, sheet)
+        except InputError as error:
+            try:
+                source, columns, units = told_poses.choices(csv, sheet)
+            except DiffeoCalibError:
+                raise error from None
+            left = [Choice("", "", f"{robot}: not used, no column is named after its joints")]
+        else:
+            return []
+    else:
+        source, columns, units = told_poses.choices(csv, sheet)
+    entries = (choice._replace(value=_from_folder(choice.value, output.parent)) for choice in source.rows.entries())
+    sep = Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
+    files = Choice("output", csv.with_suffix(".safetensors").name, "the model")
+    report = Choice("report", csv.with_suffix(".html").name, "the report")
+    return [*left, *columns, *entries, sep, Choice("decimal", sheet.decimal, "the same"), *units, files, report]
 
 
 def _from_folder(value: Any, folder: Path) -> Any:
@@ -346,6 +369,7 @@ def _left(source: Source, lengths: list[str], slides: list[Any], *, boards: bool
 
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
+    columns += [str(choice.value).partition("=")[0] for choice in choices if choice.name == "robot-pose"]
     texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
     corners = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
     names = (name for text in texts for name in text.rpartition("=")[2].split(","))

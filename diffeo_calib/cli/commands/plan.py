@@ -20,7 +20,7 @@ from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, plan
 from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
+from diffeo_calib.cli.tables import joint_columns, joints_of, stated_units, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -65,7 +65,7 @@ def run(given: PlanOptions) -> None:
         table = table_format(stated)
         source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
-        names = joint_columns(stated.joints, robot)
+        names = joint_columns(joints_of(stated), robot)
 
         def configurations(table_of: Path | None) -> Tensor | None:
             return None if table_of is None else read_joints(table_of, names, table, kinds=robot.kinds)

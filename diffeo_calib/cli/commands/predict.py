@@ -14,7 +14,7 @@ from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, table_format, with_rows
+from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.joint_ranges import OutsideRange
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import open_joints
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
@@ -82,7 +83,9 @@ def run(given: PredictOptions) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> tuple[TableFormat, str | None]:
+def _written_as_read(
+    model: CalibratedKinematics, given: PredictOptions
+) -> tuple[TableFormat, str | PoseColumns | None]:
     """The format of the predictions, and the names of the joint columns, by default those of the fit."""
     units = given.units
     rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
@@ -90,7 +93,7 @@ def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> tupl
     if units.length is None or units.angle is None:
         rotation_angle = rows.rotation_angle or read.rotation_angle
         rows = Rows(convention=rows.convention or read.convention, rotation_angle=rotation_angle, payload=read.payload)
-    return with_rows(table_format(stated), rows), stated.joints
+    return with_rows(table_format(stated), rows), joints_of(stated)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

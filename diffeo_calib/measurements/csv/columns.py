@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -14,6 +14,7 @@ from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import Hideable, repeated
 from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,
@@ -41,6 +42,8 @@ class ChainLike(Protocol):
         ...
 
 
+Joints = Sequence[str] | ChainLike | PoseColumns
+"""Columns of joint values: their names, a robot whose joints they are named after, or those of a pose."""
 Values = dict[Any, Tensor]
 """Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`; rotations are as in the file."""
 
@@ -97,7 +100,7 @@ class Columns:
 
     Args:
         table: units, and the convention of the rotation.
-        joints: names or expressions of n joints.
+        joints: names or expressions of n joints, or the columns of a pose.
         prismatic: (n,) which of them are prismatic.
         triples: names of x, y and z of every marker.
         rotation: names of the columns of the rotations, as many for each of the triples.
@@ -109,7 +112,7 @@ class Columns:
     """
 
     table: TableFormat
-    joints: JointExpressions
+    joints: JointExpressions | PoseColumns
     prismatic: Tensor
     triples: list[tuple[str, ...]]
     rotation: tuple[str, ...] = ()
@@ -123,7 +126,7 @@ class Columns:
     def of(
         cls,
         table: TableFormat,
-        joints: Sequence[str] | ChainLike,
+        joints: Joints,
         kinds: Sequence[str] | None,
         triples: list[tuple[str, ...]],
         readings: Sequence[Reported] = (),
@@ -145,7 +148,8 @@ class Columns:
         std = _std_names(table.std, len(triples))
         if table.payload is not None:
             column_names("payload", [table.payload], "the name of a column", (1,))
-        own = table, JointExpressions.of(names), prismatic, triples, rotation, std, rotation_std
+        read = replace(joints, angle=table.angle) if isinstance(joints, PoseColumns) else JointExpressions.of(names)
+        own = table, read, prismatic, triples, rotation, std, rotation_std
         columns = cls(*own, kinds_known, tuple(readings), all_hidden)
         twice = repeated(columns.names) or repeated(names)
         if twice:
@@ -280,10 +284,10 @@ def check_count(what: str, items: Sequence[object], count: int, each: str) -> No
         raise MeasurementError.of(what, expected=count, got=got, fix=f"pass one per {each}")
 
 
-def _joint_columns(
-    joints: Sequence[str] | ChainLike, kinds: Sequence[str] | None
-) -> tuple[tuple[str, ...], Tensor, bool]:
+def _joint_columns(joints: Joints, kinds: Sequence[str] | None) -> tuple[tuple[str, ...], Tensor, bool]:
     """Names of the joints, which of them are prismatic, and whether that is known."""
+    if isinstance(joints, PoseColumns):
+        joints, kinds = joints.texts, kinds if joints.robot is None else joints.robot.kinds
     if isinstance(joints, ChainLike):
         joints, kinds = joints.joint_names, joints.kinds if kinds is None else kinds
     if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):

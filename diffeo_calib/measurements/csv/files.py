@@ -7,6 +7,7 @@ Every mistake in a file is one error that names the file, the line and the colum
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -20,7 +21,8 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
@@ -31,6 +33,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.sockets import Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
+from diffeo_calib.robots.se3 import transforms
 
 LOG = logging.getLogger(__name__)
 Rows = TypeVar("Rows", bound=RowGroups)
@@ -297,7 +300,7 @@ def read_readings(
 
 def read_joints(
     path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
+    joints: Joints,
     table: TableFormat,
     *,
     kinds: Sequence[str] | None = None,
@@ -316,10 +319,21 @@ def read_joints(
 
 def open_joints(
     path: str | PathLike[str],
-    joints: Sequence[str] | ChainLike,
+    joints: Joints,
     table: TableFormat,
     *,
     kinds: Sequence[str] | None = None,
 ) -> TableFile:
     """The same file as :func:`read_joints` reads, to be read in blocks."""
     return TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
+
+
+def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
+    """The poses (N, 4, 4), or places (N, k), m, to which a machine was told to go."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numbers of rotations are read as angles
+        cells = read_joints(path, replace(columns, robot=None), replace(table, angle="rad", joint_length=None))
+    poses = replace(columns, angle=table.angle).poses(cells)
+    if poses.ndim == 2:
+        return poses / table.joints_per_metre
+    return transforms(poses[:, :3, :3], poses[:, :3, 3] / table.joints_per_metre)

@@ -1,0 +1,257 @@
+"""Proposals of `diffeo-calib init` for tables with poses or places of the machine in place of joint values."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.cli import proposals
+from diffeo_calib.cli.column_names import column, whole
+from diffeo_calib.cli.guesses import ROTATIONS, Sheet
+from diffeo_calib.cli.proposals import ALL_CONVENTIONS, Source
+from diffeo_calib.cli.row_columns import Choice, RowColumns, matrix_in, rows_in
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.measurements.csv.files import read_joints, read_poses
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.poses import numbers_of, rotation_matrices
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.cartesian import cartesian
+
+MACHINE = frozenset(
+    [
+        "robot",
+        "flange",
+        "tcp",
+        "tool",
+        "ee",
+        "eef",
+        "effector",
+        "gripper",
+        "hand",
+        "command",
+        "commanded",
+        "cmd",
+        "base",
+        "machine",
+    ]
+)
+SEEN = frozenset(
+    [
+        "board",
+        "camera",
+        "cam",
+        "marker",
+        "tracker",
+        "tag",
+        "chessboard",
+        "charuco",
+        "aruco",
+        "pattern",
+        "target",
+        "object",
+        "world",
+    ]
+)
+"""Words of names of the machine's own poses, and of what was seen."""
+LARGEST_IN_METRES = 20.0
+"""No machine is told a place so far away, m."""
+MOST_PAIRS = 12
+"""Of conventions that are tried on positions, too."""
+ALIKE = 3.0
+"""Turns between rows differ, read in a wrong way, by more than so many times what they differ by in the right one."""
+TURN_TOLERANCE_RAD = 0.01
+
+
+@dataclass(frozen=True)
+class Body:
+    """Columns of a place, and of the rotation behind it, if any."""
+
+    place: list[str]
+    turn: list[str]
+
+    @property
+    def words(self) -> set[str]:
+        """Of the names."""
+        return {word for name in self.place for word in column(name).words}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the machine's rotation, or the measured one: convention, and unit of its angles."""
+
+    convention: str = ""
+    angle: str = "rad"
+
+
+def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
+    """Places with the rotations that follow them, or poses as 16 numbers, in the order of the columns."""
+    places = [list(group.names.values()) for group in whole(sheet.numbers, "xyz")]
+    triples = [group for group in whole(sheet.numbers, "xyz") if not group.says("rate", "deviation", "turn")]
+    places = sorted((list(group.names.values()) for group in triples), key=lambda own: sheet.header.index(own[0]))
+    found, starts = list[Body](), [sheet.header.index(own[0]) for own in places] + [len(sheet.header)]
+    for own, end in zip(places, starts[1:], strict=True):
+        behind = [name for name in sheet.header[sheet.header.index(own[0]) : end] if name in sheet.numbers]
+        turns = [
+            list(group.names.values())
+            for labels, _ in ROTATIONS
+            for group in whole([name for name in behind if name not in own], labels)
+            if not group.says("rate", "deviation")
+        ]
+        found.append(Body(own, turns[0] if turns else []))
+    left = list(sheet.numbers)
+    while not places and (matrix := matrix_in(csv, sheet, left)):
+        place, turn = (list(names) for names in matrix)
+        found.append(Body(place, turn))
+        left = [name for name in left if name not in (*place, *turn)]
+    return found
+
+
+def machine_of(bodies: Sequence[Body]) -> Body:
+    """That of the machine: by words of the names, else the first."""
+    return max(bodies, key=lambda own: len(own.words & MACHINE) - len(own.words & SEEN))
+
+
+def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]]:
+    """The table read as poses of a machine; entries about its columns, and about units and conventions.
+
+    Raises:
+        InputError: no poses, nothing that was measured, or no reading of the rows that is clear.
+    """
+    bodies = bodies_in(csv, sheet)
+    if not bodies:
+        expected = "a ROBOT whose joints the table has columns of, or columns of the poses that a machine was told"
+        raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
+    machine = machine_of(bodies)
+    used = [*machine.place, *machine.turn]
+    rows = rows_in(csv, replace(sheet, numbers=tuple(name for name in sheet.numbers if name not in used)), used)
+    rows = replace(rows, markers=rows.markers[:1])
+    body = next((own for own in bodies if rows.markers and own.place == rows.markers[0]), None)
+    found = sorted(_read(csv, sheet, machine, rows, body), key=lambda entry: entry[0])
+    if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
+        got = "no way to read them" if not found else f"{100 * found[0][0]:.3g} % of what the rows vary unexplained"
+        what = f"poses of the machine in {few(used, 16)}"
+        fix = (
+            "check that the rows belong together, or write the campaign file yourself; for joint values name the robot"
+        )
+        raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
+    size, source = found[0]
+    others = [one for one in found[1:] if one[0] < gates.READINGS_TOLD_APART * size]
+    worse = next((left for left, _ in found if left >= gates.READINGS_TOLD_APART * size), inf)
+    return source, *_entries(source, machine, size, worse, [one for _, one in others])
+
+
+def _entries(
+    source: Source, machine: Body, size: float, worse: float, others: Sequence[Source]
+) -> tuple[list[Choice], list[Choice]]:
+    """Entries about columns, and about units and conventions; comments where readings are as good."""
+    why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
+    why += f", read in any other way {100 * worse:.3g} %" if worse < inf else ""
+    first = "; by their names, poses that the machine was told, in place of joint values"
+    texts = list(dict.fromkeys(_text(one.joints) for one in (source, *others)))
+    columns = [Choice("robot-pose", text, why + first, sure=len(texts) == 1) for text in texts]
+    table, units = source.table, list[Choice]()
+    units.append(Choice("length", table.length, "the size of the numbers"))
+    units.append(Choice("angle", table.angle, why))
+    if table.joint_length is not None:
+        units.append(Choice("joint-length", table.joint_length, why))
+    if table.rotation is not None:
+        units.append(Choice("rotation", ",".join(map(str, table.rotation)), "behind the columns of its place"))
+        known = list(dict.fromkeys((one.table.convention, one.table.rotation_angle) for one in (source, *others)))
+        for convention, angle in known:
+            units.append(Choice("convention", str(convention), why, sure=len(known) == 1))
+            if angle is not None:
+                units.append(Choice("rotation-angle", angle, "the same", sure=len(known) == 1))
+    if table.camera_on_tool:
+        units.append(Choice("camera-on-tool", True, "what stands is seen from the flange"))
+    return columns, units
+
+
+def _text(joints: Any) -> str:
+    """The value of --robot-pose."""
+    return ",".join(joints.columns) + f"={joints.convention}" * bool(joints.convention)
+
+
+def _read(
+    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None
+) -> Iterator[tuple[float, Source]]:
+    """All ways to read the table, and the share of what the rows vary that each leaves unexplained."""
+    turn = body.turn if body is not None else []
+    numbers = {name: _numbers(csv, sheet, own) for name, own in (("machine", machine.turn), ("seen", turn))}
+    pairs = _alike(numbers["machine"], numbers["seen"])
+    places = _numbers(csv, sheet, machine.place)
+    length = _length(machine.place, places)
+    seen_at = None if body is None else _numbers(csv, sheet, body.place)
+    other = length if body is None or seen_at is None else _length(body.place, seen_at)
+    for (own, seen), camera in product(pairs, (False, True) if turn or rows.of_boards else (False,)):
+        pose = PoseColumns((*machine.place, *machine.turn), own.convention)
+        table = TableFormat(other, own.angle, sheet.sep, sheet.decimal)
+        table = replace(table, joint_length=None if length == other else length, camera_on_tool=camera)
+        if turn:
+            unit = seen.angle if len(turn) == 3 else None
+            table = replace(table, rotation=turn, convention=seen.convention, rotation_angle=unit)
+        with warnings.catch_warnings(), suppress(DiffeoCalibError):
+            warnings.simplefilter("ignore")
+            robot = cartesian(read_poses(csv, pose, table))
+            source = Source(csv, robot, replace(pose, robot=robot), rows, table, sheet.numbers)
+            yield source.residual(table), source
+
+
+def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor | None:
+    """Columns as they are (N, c); None without any, or with empty cells."""
+    if not names:
+        return None
+    with warnings.catch_warnings(), suppress(DiffeoCalibError):
+        warnings.simplefilter("ignore")
+        return read_joints(csv, list(names), TableFormat("m", "rad", sheet.sep, sheet.decimal))
+    return None
+
+
+def _length(names: Sequence[str], values: Tensor | None) -> str:
+    """Unit of lengths, by the names, or by the size of the numbers."""
+    named = {column(name).unit for name in names} - {""}
+    if len(named) == 1:
+        return named.pop()
+    return "mm" if values is not None and float(values.abs().max()) > LARGEST_IN_METRES else "m"
+
+
+def _readings(numbers: Tensor | None) -> dict[Reading, Tensor]:
+    """Rotations (N, 3, 3) in every convention that can be meant."""
+    found = dict[Reading, Tensor]()
+    count = 0 if numbers is None else numbers.shape[1]
+    for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == count):
+        for angle in ("deg", "rad") if count == 3 else ("rad",):
+            with suppress(InputError):
+                found[Reading(convention, angle)] = rotation_matrices(numbers, convention, angle=angle)
+    return found
+
+
+def _alike(machine: Tensor | None, seen: Tensor | None) -> list[tuple[Reading, Reading]]:
+    """Ways to read both rotations in which both turn by the same angles between rows, the likeliest first."""
+    first, second = _readings(machine) or {Reading(): None}, _readings(seen) or {Reading(): None}
+    pairs = list(product(first, second))
+    if machine is None or seen is None:
+        return pairs
+    angles = [{how: _turns(R) for how, R in each.items() if R is not None} for each in (first, second)]
+    size = {(a, b): float((angles[0][a] - angles[1][b]).abs().median()) for a, b in pairs}
+    pairs.sort(key=size.__getitem__)
+    largest = max(ALIKE * size[pairs[0]], TURN_TOLERANCE_RAD)
+    return [pair for pair in pairs if size[pair] <= largest][:MOST_PAIRS]
+
+
+def _turns(R: Tensor) -> Tensor:
+    """Angles between rows that follow each other, and between those farther apart, rad."""
+    found = list[Tensor]()
+    for step in (1, 2, 3, 5):
+        D = R.mT @ R.roll(step, 0)
+        found.append(((D.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos())
+    return torch.cat(found)

@@ -1,0 +1,58 @@
+"""The error field of a machine that is told places: corrections of its commands on a grid."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import torch
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.compensation.compensate import compensate
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.robots.cartesian import SLIDES, is_cartesian
+
+MOST_POINTS = 100_000
+DIGITS = 7
+
+
+def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
+    """A table of places within those of the fit, what to add to commands there, and its standard deviations, as CSV.
+
+    Orientations are in the middle of those of the fit. Deviations are those of the first marker, or point of a pose,
+    along the axes of the machine.
+
+    Args:
+        model: of a machine that is told places or poses, see :func:`diffeo_calib.cartesian`.
+        grid: numbers of points along each axis, such as "5x5x3". length: unit in the file.
+
+    Raises:
+        InputError: a model of joint values, another number of axes, or more than 100,000 points.
+    """
+    robot, counts = model.robot, [int(word) if word.isdigit() else 0 for word in grid.lower().split("x")]
+    axes = min(robot.n, len(SLIDES))
+    if not is_cartesian(robot):
+        fix = "calibrate with --robot-pose, or correct a program with `correct`"
+        raise InputError.of("an error field", expected="a machine that is told places", got=robot.name, fix=fix)
+    if len(counts) != axes or min(counts) < 2:
+        expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}"
+        raise InputError.of(f"--grid {grid}", expected=expected)
+    if (points := int(torch.tensor(counts).prod())) > MOST_POINTS:
+        raise InputError.of(f"--grid {grid}", expected=f"at most {MOST_POINTS} points", got=points)
+    fitted = model.configurations
+    ends = zip(fitted.amin(0)[:axes].tolist(), fitted.amax(0)[:axes].tolist(), counts, strict=True)
+    lines = [torch.linspace(*each, dtype=fitted.dtype) for each in ends]
+    places = torch.cartesian_prod(*lines).view(-1, axes)
+    q = torch.cat([places, places.new_zeros(len(places), robot.n - axes)], 1)
+    targets = robot(q) @ model.tool
+    found = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
+    base = model.geometry.base[:3, :3]
+    known = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
+    deviations = known.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
+    cells = UNITS_PER_METRE[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
+    text = io.StringIO(newline="")
+    sheet = csv.writer(text)
+    sheet.writerow([f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]])
+    sheet.writerows(cells.round(decimals=DIGITS).tolist())
+    return text.getvalue()
