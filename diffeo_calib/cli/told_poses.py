@@ -24,52 +24,34 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.poses import numbers_of, rotation_matrices
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
+from diffeo_calib.robots.se3 import nearest_rotations
 
-MACHINE = frozenset(
-    [
-        "robot",
-        "flange",
-        "tcp",
-        "tool",
-        "ee",
-        "eef",
-        "effector",
-        "gripper",
-        "hand",
-        "command",
-        "commanded",
-        "cmd",
-        "base",
-        "machine",
-    ]
-)
-SEEN = frozenset(
-    [
-        "board",
-        "camera",
-        "cam",
-        "marker",
-        "tracker",
-        "tag",
-        "chessboard",
-        "charuco",
-        "aruco",
-        "pattern",
-        "target",
-        "object",
-        "world",
-    ]
-)
+MACHINE = {"robot", "flange", "tcp", "tool", "ee", "eef", "effector", "gripper", "hand", "command", "cmd", "base"}
+SEEN = {
+    "board",
+    "camera",
+    "cam",
+    "marker",
+    "tracker",
+    "tag",
+    "charuco",
+    "aruco",
+    "pattern",
+    "target",
+    "object",
+    "world",
+}
 """Words of names of the machine's own poses, and of what was seen."""
 LARGEST_IN_METRES = 20.0
 """No machine is told a place so far away, m."""
-MOST_PAIRS = 12
-"""Of conventions that are tried on positions, too."""
-ALIKE = 3.0
-"""Turns between rows differ, read in a wrong way, by more than so many times what they differ by in the right one."""
-TURN_TOLERANCE_RAD = 0.01
+MOST_ROWS, STEPS = 40, (1, 3)
+"""Rows whose motions are compared, and how many rows each of these spans."""
+MOST_WAYS = 8
+"""Ways to read the rows that are tried with a registration."""
+ALIKE = 6.0
+"""Ways that leave more than so many times what the best one leaves are wrong."""
 
 
 @dataclass(frozen=True)
@@ -184,21 +166,24 @@ def _text(joints: Any) -> str:
 def _read(
     csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None
 ) -> Iterator[tuple[float, Source]]:
-    """All ways to read the table, and the share of what the rows vary that each leaves unexplained."""
-    turn = body.turn if body is not None else []
-    numbers = {name: _numbers(csv, sheet, own) for name, own in (("machine", machine.turn), ("seen", turn))}
-    pairs = _alike(numbers["machine"], numbers["seen"])
-    places = _numbers(csv, sheet, machine.place)
-    length = _length(machine.place, places)
-    seen_at = None if body is None else _numbers(csv, sheet, body.place)
+    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
+    turn, seen_at = ([], None) if body is None else (body.turn, _numbers(csv, sheet, body.place))
+    told_at = _numbers(csv, sheet, machine.place)
+    length = _length(machine.place, told_at)
     other = length if body is None or seen_at is None else _length(body.place, seen_at)
-    for (own, seen), camera in product(pairs, (False, True) if turn or rows.of_boards else (False,)):
-        pose = PoseColumns((*machine.place, *machine.turn), own.convention)
-        table = TableFormat(other, own.angle, sheet.sep, sheet.decimal)
+    own, seen = (_readings(_numbers(csv, sheet, names)) for names in (machine.turn, turn))
+    if own and seen and told_at is not None and seen_at is not None:
+        metres = [values / UNITS_PER_METRE[unit] for values, unit in ((told_at, length), (seen_at, other))]
+        ways = _alike((metres[0], own), (metres[1], seen))
+    else:
+        ways = list(product(own or [Reading()], seen or [Reading()], (False, True) if rows.of_boards else (False,)))
+    for told, measured, camera in ways:
+        pose = PoseColumns((*machine.place, *machine.turn), told.convention)
+        table = TableFormat(other, told.angle, sheet.sep, sheet.decimal)
         table = replace(table, joint_length=None if length == other else length, camera_on_tool=camera)
         if turn:
-            unit = seen.angle if len(turn) == 3 else None
-            table = replace(table, rotation=turn, convention=seen.convention, rotation_angle=unit)
+            unit = measured.angle if len(turn) == 3 else None
+            table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
         with warnings.catch_warnings(), suppress(DiffeoCalibError):
             warnings.simplefilter("ignore")
             robot = cartesian(read_poses(csv, pose, table))
@@ -235,23 +220,46 @@ def _readings(numbers: Tensor | None) -> dict[Reading, Tensor]:
     return found
 
 
-def _alike(machine: Tensor | None, seen: Tensor | None) -> list[tuple[Reading, Reading]]:
-    """Ways to read both rotations in which both turn by the same angles between rows, the likeliest first."""
-    first, second = _readings(machine) or {Reading(): None}, _readings(seen) or {Reading(): None}
-    pairs = list(product(first, second))
-    if machine is None or seen is None:
-        return pairs
-    angles = [{how: _turns(R) for how, R in each.items() if R is not None} for each in (first, second)]
-    size = {(a, b): float((angles[0][a] - angles[1][b]).abs().median()) for a, b in pairs}
-    pairs.sort(key=size.__getitem__)
-    largest = max(ALIKE * size[pairs[0]], TURN_TOLERANCE_RAD)
-    return [pair for pair in pairs if size[pair] <= largest][:MOST_PAIRS]
+def _alike(
+    told: tuple[Tensor, dict[Reading, Tensor]], seen: tuple[Tensor, dict[Reading, Tensor]]
+) -> list[tuple[Reading, Reading, bool]]:
+    """Ways to read the rotations of both bodies, and whether what stands was seen from the flange, the likeliest first.
+
+    Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: the rotation of X from the
+    axes of both, its shift by linear least squares, and what is left.
+
+    Args:
+        told: places (N, 3), m, of the machine, and its rotations (N, 3, 3) by reading. seen: the same of the other.
+    """
+    some = slice(None, None, -(-len(told[0]) // MOST_ROWS))
+    found = list[tuple[float, tuple[Reading, Reading, bool]]]()
+    R, t = _motions(told[0][some], torch.stack([*told[1].values()])[:, some])
+    for camera in (False, True):
+        turns, places = torch.stack([*seen[1].values()])[:, some], seen[0][some]
+        shifts = -(turns.mT @ places[:, :, None])[..., 0] if camera else places
+        S, u = _motions(shifts, turns.mT if camera else turns)
+        X = nearest_rotations(torch.einsum("aki,bkj->abij", _axes(R), _axes(S)))  # (a, b, 3, 3)
+        turned = R[:, None] @ X[:, :, None] - X[:, :, None] @ S  # (a, b, K, 3, 3)
+        G = R - torch.eye(3, dtype=R.dtype, device=R.device)
+        right = torch.einsum("abij,bkj->abki", X, u) - t[:, None]
+        shift = torch.einsum("aij,abj->abi", torch.linalg.pinv(G.flatten(1, 2)), right.flatten(2))
+        moved = (torch.einsum("akij,abj->abki", G, shift) - right).square().sum(3).mean(2)
+        left = turned.square().sum((3, 4)).mean(2).sqrt() + (moved / t.square().sum(2).mean(1)[:, None]).sqrt()
+        each = product(told[1], seen[1])
+        found += [(float(size), (*pair, camera)) for size, pair in zip(left.flatten(), each, strict=True)]
+    found.sort(key=lambda entry: entry[0])
+    return [way for size, way in found if size <= ALIKE * found[0][0]][:MOST_WAYS]
 
 
-def _turns(R: Tensor) -> Tensor:
-    """Angles between rows that follow each other, and between those farther apart, rad."""
-    found = list[Tensor]()
-    for step in (1, 2, 3, 5):
-        D = R.mT @ R.roll(step, 0)
-        found.append(((D.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos())
-    return torch.cat(found)
+def _motions(places: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+    """Motions from rows to later ones, in the frame of the first: (c, K, 3, 3), and (c, K, 3), m."""
+    places = places.expand(len(R), -1, -1)
+    pairs = [(R.roll(-step, 1), places.roll(-step, 1)) for step in STEPS]
+    turns = torch.cat([R.mT @ later for later, _ in pairs], 1)
+    return turns, torch.cat([(R.mT @ (later - places)[..., None])[..., 0] for _, later in pairs], 1)
+
+
+def _axes(R: Tensor) -> Tensor:
+    """Axes times sines of the angles of rotations (..., 3, 3): (..., 3)."""
+    D = 0.5 * (R - R.mT)
+    return torch.stack([D[..., 2, 1], D[..., 0, 2], D[..., 1, 0]], -1)

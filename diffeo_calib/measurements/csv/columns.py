@@ -243,8 +243,9 @@ class Columns:
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         found, table = self._parts(raw), self.table
-        q = self.joints.values(found["q"])[:, self.joints.plain]
-        slide = self.prismatic[self.joints.plain]
+        plain = self.joints.plain
+        q = self.joints.values(found["q"])[:, plain] if bool(plain.any()) else found["q"][:, :0]
+        slide = self.prismatic[plain]
         angle, known = _largest(q[:, ~slide]), self.kinds_known
         sentences = unlikely_units("angles", angle, table.angle, "angle", kinds_known=known)
         sentences += unlikely_units("prismatic joints", _largest(q[:, slide]), table.joint_unit, "joint_length")
