@@ -5,7 +5,7 @@ rotation M, and turns about z, y and x,
 
     pose(p) = T(x, y, z) M R_z(a) R_y(b) R_x(c).
 
-M is the middle of the poses, so that b stays far from +-90 degrees, where a and c are not told apart.
+M is the middle of the poses, or turned so that b stays far from +-90 degrees, where a and c are not told apart.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
 """Names of the joints."""
 BEYOND = 0.25
 """Limits lie beyond the poses by this share of their range."""
-STEEPEST = 0.97
-"""Sine of the largest b."""
+FLAT, STEEPEST = 0.8, 0.97
+"""Sine of the largest b about the mean of the poses, and about any middle."""
+DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
+"""Of the z-axis of M that are tried."""
 TOLERANCE = 1e-3
 """Files have few digits."""
 
@@ -47,7 +49,7 @@ def cartesian(poses: object) -> Chain:
     given = _checked(poses)
     if given.ndim == 2:
         return _chain(given)
-    middle = nearest_rotations(given[:, :3, :3].mean(0))
+    middle = _middle(given[:, :3, :3])
     return _chain(pose_inputs(_chain(given[:, :3, 3], middle), given), middle)
 
 
@@ -82,6 +84,21 @@ def pose_inputs(robot: Tree, poses: object) -> Tensor:
         raise InputError.of(f"`poses`, row {row}", expected=expected, got=got, fix=fix)
     turns = torch.atan2(R[:, 1, 0], R[:, 0, 0]), torch.asin(-R[:, 2, 0]), torch.atan2(R[:, 2, 1], R[:, 2, 2])
     return torch.cat([given[:, :3, 3], torch.stack(turns, 1)], 1)
+
+
+def _middle(R: Tensor) -> Tensor:
+    """M (3, 3) of rotations (N, 3, 3): their mean; of widely spread ones a frame whose z is far from all their x."""
+    mean, x = nearest_rotations(R.mean(0)), R[:, :, 0]
+    if float((x @ mean[:, 2]).abs().max()) < FLAT:
+        return mean
+    k = torch.arange(DIRECTIONS, dtype=R.dtype, device=R.device) + 0.5
+    height, turn = 1.0 - k / DIRECTIONS, GOLDEN_ANGLE_RAD * k  # half a sphere
+    radius = (1.0 - height.square()).sqrt()
+    ways = torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
+    z = ways[(x @ ways.mT).abs().amax(0).argmin()]
+    side = torch.linalg.cross(z, mean[:, (mean.mT @ z).abs().argmin()], dim=0)
+    side = side / side.norm()
+    return torch.stack([torch.linalg.cross(side, z, dim=0), side, z], 1)
 
 
 def _checked(poses: object) -> Tensor:

@@ -78,7 +78,7 @@ def test_two_joint_columns_swapped(arm: Few) -> None:
     order = list(range(6))
     first, second = 2, 4
     order[first], order[second] = second, first
-    words = "the rows fit, in degrees and mm, with joints='waist_joint,shoulder_joint,.wrist_bend_joint.,"
+    words = "the rows fit, in degrees and mm, with joints='waist_joint,shoulder_joint,wrist_bend_joint,"
     with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}"):
         dc.calibrate(arm.robot, dc.Measurements(arm.rows.q[:, order], arm.rows.points))
 

@@ -1,0 +1,192 @@
+"""Tables with poses or places of a machine in place of joint values: from `init` to a corrected program."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import Command
+from torch import Tensor
+
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+ROWS = 24
+DOWN = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+
+
+def cells(path: Path) -> list[list[str]]:
+    return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def drawn(*shape: int, seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def turned(axes: Tensor) -> Tensor:
+    """Rotations (N, 3, 3) of rotation vectors (N, 3), rad."""
+    K = torch.zeros(len(axes), 3, 3, dtype=torch.float64)
+    K[:, 2, 1], K[:, 0, 2], K[:, 1, 0] = axes.unbind(1)
+    return (K - K.mT).matrix_exp()
+
+
+def flange(seed: int = 0) -> Tensor:
+    """(N, 4, 4) poses of a flange above a board at (0.5, 0, 0), m."""
+    draws = drawn(ROWS, 6, seed=seed)
+    R = turned(0.35 * draws[:, 3:]) @ torch.tensor(DOWN, dtype=torch.float64)
+    places = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) - 0.4 * R[:, :, 2] + 0.05 * draws[:, :3]
+    return transforms(R, places)
+
+
+CAMERA = transforms(turned(torch.tensor([[0.1, -0.05, 0.8]])), torch.tensor([[0.03, -0.06, 0.05]]))[0]
+BOARD = transforms(turned(torch.tensor([[0.02, 0.01, 0.3]])), torch.tensor([[0.5, 0.02, 0.01]]))[0]
+
+
+def seen(told: Tensor, *, camera_on_tool: bool, seed: int = 9) -> Tensor:
+    """(N, 4, 4) what a camera measures, m: the board of a camera on the tool, or the tool of a fixed one."""
+    exact = torch.linalg.inv(told @ CAMERA) @ BOARD if camera_on_tool else torch.linalg.inv(BOARD) @ told @ CAMERA
+    noise = drawn(len(told), 6, seed=seed)
+    return transforms(turned(3e-4 * noise[:, 3:]) @ exact[:, :3, :3], exact[:, :3, 3] + 1e-4 * noise[:, :3])
+
+
+def write(path: Path, **columns: Tensor) -> Path:
+    """A table with the columns of each group, such as ``x_y_z=(N, 3)``."""
+    names = [name for group in columns for name in group.split("_")]
+    lines = [",".join(f"{value:.8g}" for value in row) for row in torch.cat([*columns.values()], 1).tolist()]
+    path.write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
+    return path
+
+
+def hand_eye_table(path: Path, convention: str, angle: str, *, camera_on_tool: bool) -> Path:
+    told = flange()
+    found = seen(told, camera_on_tool=camera_on_tool)
+    turns = rotation_numbers(told[:, :3, :3], convention, angle=angle)
+    quaternions = rotation_numbers(found[:, :3, :3], "quat_wxyz")
+    own = "_".join(("RX", "RY", "RZ") if turns.shape[1] == 3 else ("q0", "q1", "q2", "q3"))
+    poses = {"X_Y_Z": 1e3 * told[:, :3, 3], own: turns}
+    return write(path, **poses, tx_ty_tz=1e3 * found[:, :3, 3], qw_qx_qy_qz=quaternions)
+
+
+@pytest.mark.parametrize(
+    ("convention", "angle", "camera_on_tool"),
+    [("xyz", "deg", True), ("ZYX", "deg", False), ("rotvec", "rad", True), ("quat_wxyz", "rad", False)],
+)
+def test_init_finds_what_the_numbers_mean(
+    convention: str, angle: str, camera_on_tool: bool, tmp_path: Path, command: Command
+) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", convention, angle, camera_on_tool=camera_on_tool)
+    done = command("init", table, "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.error
+    found = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
+    assert found["robot-pose"].endswith(f"={convention}")
+    assert found["robot-pose"].startswith("X,Y,Z,")
+    assert found["convention"] == "quat_xyzw"
+    assert found["rotation"] == "qx,qy,qz,qw"
+    assert found["length"] == "mm"
+    assert found["angle"] == angle or convention.startswith("quat")
+    assert found.get("camera-on-tool", False) is camera_on_tool
+
+
+def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    SimulatedArm().write_urdf(tmp_path / "arm.urdf")
+    done = command("init", table, tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    text = (tmp_path / "c.toml").read_text(encoding="utf-8")
+    assert "not used, no column is named after its joints" in text
+    assert 'robot-pose = "X,Y,Z,RX,RY,RZ=xyz"' in text
+    assert done.code == 0
+
+
+@pytest.mark.slow
+def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
+    assert done.code == 0, done.error
+    for name, link, truth in (("camera", "in_tip", CAMERA), ("board", "in_base", BOARD)):
+        found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["results"]["hand_eye"][f"{name}_{link}"]
+        away = torch.tensor(found["pose_m"], dtype=torch.float64)[:3, 3] - truth[:3, 3]
+        assert bool((away.abs() < 4 * torch.tensor(found["position_std_m"])).all())
+        assert float(away.norm()) < 1e-3
+    model = tmp_path / "t.safetensors"
+    done = command("export", model, "--camera", tmp_path / "camera")
+    assert done.code == 0, done.error
+    text = (tmp_path / "camera" / "easy_handeye2.calib").read_text(encoding="utf-8")
+    assert 'calibration_type: "eye_in_hand"' in text
+    x = float(text.partition("x: ")[2].partition("\n")[0])
+    assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
+    # the same poses again: predicted and planned under the names of the table, and corrected by little
+    assert command("predict", model, table, "-o", tmp_path / "p.csv").code == 0
+    assert command("plan", model, "-n", "3", "-o", tmp_path / "n.csv").code == 0
+    done = command("correct", model, table, "-o", tmp_path / "d.csv")
+    assert done.code == 0, done.error
+    (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
+    for one, other in zip(before, after, strict=True):
+        assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
+    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+
+
+def bent(places: Tensor) -> Tensor:
+    """A gantry out of square by 1 mrad, whose rail is bent, m."""
+    x, y, z = places.unbind(1)
+    return torch.stack([x + 1e-3 * y, y + 3e-4 * torch.sin(5.0 * x), z], 1)
+
+
+def without_frames(there: Tensor, wanted: Tensor) -> float:
+    """RMS distance, m, wherever the measuring frame is."""
+    T = rigid_fit(there, wanted)
+    return float((there @ T[:3, :3].mT + T[:3, 3] - wanted).square().sum(1).mean().sqrt())
+
+
+@pytest.mark.slow
+def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command) -> None:
+    told = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    measured = bent(told) + 2e-5 * drawn(80, 3, seed=2)
+    table = write(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * told, "x_y_z": 1e3 * measured})
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
+    done = command("fit", tmp_path / "c.toml")
+    assert done.code == 0, done.error
+    done = command(
+        "export", tmp_path / "t.safetensors", "--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"
+    )
+    assert done.code == 0, done.error
+    field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
+    assert field.shape == (32, 9)
+    place, add, std = field.double().split(3, 1)
+    assert without_frames(bent(place + add), place) < 0.15 * without_frames(bent(place), place)
+    assert bool((std > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--robot", "arm.urdf"], "--robot, --base or --tip beside --robot-pose"),
+        (["--joints", "X,Y,Z,RX,RY,RZ"], "--joints beside --robot-pose"),
+    ],
+)
+def test_options_that_exclude_each_other(options: list[str], message: str, tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    (tmp_path / "arm.urdf").write_text("<robot/>", encoding="utf-8")
+    given = ["--robot-pose", "X,Y,Z,RX,RY,RZ=xyz", "--length", "mm", "--angle", "deg", "--position", "tx,ty,tz"]
+    words = [str(tmp_path / word) if word.endswith(".urdf") else word for word in options]
+    done = command("fit", table, *given, *words, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert message in done.error
+
+
+def test_neither_a_robot_nor_poses(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    done = command("fit", table, "--length", "mm", "--angle", "deg", "--position", "tx,ty,tz", "-o", tmp_path / "m")
+    assert done.code == 1
+    assert "expected --robot FILE, or --robot-pose COLUMNS" in done.error
