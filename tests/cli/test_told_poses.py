@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
+from told_bank import BOARD, CAMERA, bent, drawn, flange, seen, write_columns
 from torch import Tensor
 
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 if sys.version_info >= (3, 11):
@@ -21,50 +21,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-ROWS = 24
-DOWN = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-
 
 def cells(path: Path) -> list[list[str]]:
     return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
-
-
-def drawn(*shape: int, seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def turned(axes: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) of rotation vectors (N, 3), rad."""
-    K = torch.zeros(len(axes), 3, 3, dtype=torch.float64)
-    K[:, 2, 1], K[:, 0, 2], K[:, 1, 0] = axes.unbind(1)
-    return (K - K.mT).matrix_exp()
-
-
-def flange(seed: int = 0) -> Tensor:
-    """(N, 4, 4) poses of a flange above a board at (0.5, 0, 0), m."""
-    draws = drawn(ROWS, 6, seed=seed)
-    R = turned(0.35 * draws[:, 3:]) @ torch.tensor(DOWN, dtype=torch.float64)
-    places = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) - 0.4 * R[:, :, 2] + 0.05 * draws[:, :3]
-    return transforms(R, places)
-
-
-CAMERA = transforms(turned(torch.tensor([[0.1, -0.05, 0.8]])), torch.tensor([[0.03, -0.06, 0.05]]))[0]
-BOARD = transforms(turned(torch.tensor([[0.02, 0.01, 0.3]])), torch.tensor([[0.5, 0.02, 0.01]]))[0]
-
-
-def seen(told: Tensor, *, camera_on_tool: bool, seed: int = 9) -> Tensor:
-    """(N, 4, 4) what a camera measures, m: the board of a camera on the tool, or the tool of a fixed one."""
-    exact = torch.linalg.inv(told @ CAMERA) @ BOARD if camera_on_tool else torch.linalg.inv(BOARD) @ told @ CAMERA
-    noise = drawn(len(told), 6, seed=seed)
-    return transforms(turned(3e-4 * noise[:, 3:]) @ exact[:, :3, :3], exact[:, :3, 3] + 1e-4 * noise[:, :3])
-
-
-def write(path: Path, **columns: Tensor) -> Path:
-    """A table with the columns of each group, such as ``x_y_z=(N, 3)``."""
-    names = [name for group in columns for name in group.split("_")]
-    lines = [",".join(f"{value:.8g}" for value in row) for row in torch.cat([*columns.values()], 1).tolist()]
-    path.write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
-    return path
 
 
 def hand_eye_table(path: Path, convention: str, angle: str, *, camera_on_tool: bool) -> Path:
@@ -74,7 +33,7 @@ def hand_eye_table(path: Path, convention: str, angle: str, *, camera_on_tool: b
     quaternions = rotation_numbers(found[:, :3, :3], "quat_wxyz")
     own = "_".join(("RX", "RY", "RZ") if turns.shape[1] == 3 else ("q0", "q1", "q2", "q3"))
     poses = {"X_Y_Z": 1e3 * told[:, :3, 3], own: turns}
-    return write(path, **poses, tx_ty_tz=1e3 * found[:, :3, 3], qw_qx_qy_qz=quaternions)
+    return write_columns(path, **poses, tx_ty_tz=1e3 * found[:, :3, 3], qw_qx_qy_qz=quaternions)
 
 
 @pytest.mark.parametrize(
@@ -136,12 +95,6 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
 
 
-def bent(places: Tensor) -> Tensor:
-    """A gantry out of square by 1 mrad, whose rail is bent, m."""
-    x, y, z = places.unbind(1)
-    return torch.stack([x + 1e-3 * y, y + 3e-4 * torch.sin(5.0 * x), z], 1)
-
-
 def without_frames(there: Tensor, wanted: Tensor) -> float:
     """RMS distance, m, wherever the measuring frame is."""
     T = rigid_fit(there, wanted)
@@ -152,7 +105,7 @@ def without_frames(there: Tensor, wanted: Tensor) -> float:
 def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command) -> None:
     told = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     measured = bent(told) + 2e-5 * drawn(80, 3, seed=2)
-    table = write(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * told, "x_y_z": 1e3 * measured})
+    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * told, "x_y_z": 1e3 * measured})
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
     done = command("fit", tmp_path / "c.toml")
