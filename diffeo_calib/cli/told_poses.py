@@ -119,6 +119,8 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     rows = replace(rows, markers=rows.markers[:1])
     body = next((own for own in bodies if rows.markers and own.place == rows.markers[0]), None)
     found = sorted(_read(csv, sheet, machine, rows, body), key=lambda entry: entry[0])
+    if found and found[0][0] == inf:
+        found[0][1].read_residual(found[0][1].table)  # says why
     if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
         got = "no way to read them" if not found else f"{100 * found[0][0]:.3g} % of what the rows vary unexplained"
         what = f"poses of the machine in {few(used, 16)}"
