@@ -18,18 +18,12 @@ from typer.core import TyperGroup
 
 from diffeo_calib.cli import campaign
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
-from diffeo_calib.common.errors import printable, warn_user
-
-MASS = {"--payload": "--payload-mass"}
-RENAMED = {"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}}
-"""Command -> former names of options, which had another meaning in other commands, and their names."""
+from diffeo_calib.common.errors import printable
 
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
 """Of the command that runs."""
-_renamed: list[str] = []
-"""Warnings about former names among them."""
 
 
 def command_line() -> str:
@@ -57,9 +51,7 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        if (several := campaign.asked(args, DECLARED)) is not None:
-            raise typer.Exit(campaign.run(several))
-        _arguments[:], _renamed[:] = _with_names(campaign.expanded(args, DECLARED))
+        _arguments[:] = campaign.expanded(args, DECLARED)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -68,24 +60,10 @@ class FlagsOff(TyperGroup):
         """Run a command; a bad value is named without typer's own words, and without control characters."""
         try:
             with record.written(list(_arguments)):
-                for text in _renamed:
-                    warn_user(text)
                 return super().invoke(ctx)
         except typer.BadParameter as error:
             error.message = printable(error.message.removeprefix("Value error, "))
             raise
-
-
-def _with_names(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words with the names of options in the place of former ones, and what to say about these."""
-    command = next((word for word in words if not word.startswith("-")), "")
-    found, said, names = list[str](), list[str](), RENAMED.get(command, {})
-    for word in words:
-        name, equal, value = word.partition("=")
-        if name in names:
-            said.append(f"{name} of `{command}` is called {names[name]} now; {name} will be removed")
-        found.append(names.get(name, name) + equal + value)
-    return found, said
 
 
 app = typer.Typer(

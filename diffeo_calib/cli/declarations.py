@@ -77,9 +77,6 @@ class FitOptions(Command):
         "MODEL",
     )
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
-    jobs: int | None = option(
-        "With several campaign files: how many run at a time; the exit code counts those that failed.", "N"
-    )
 
 
 @command("campaign")
@@ -105,22 +102,11 @@ class CampaignOptions(Command):
     json_lines: bool = option(
         "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
     )
-    bag: Path | None = option("Append the stops of a ROS 2 bag to CSV, at their times; see `record`.", "BAG")
-    seen: str | None = option("Topic of --bag: stamped points, poses or transforms that a device measured.", "TOPIC")
-    joint_states: str = option("Topic of --bag: joint states.", "TOPIC", default="/joint_states")
-    speed: float = option("How many times faster --bag is played than it was recorded.", min=1e-3, default=1.0)
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
     page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
     next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
     accepted: Path | None = written("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
-
-    def check(self) -> None:
-        if (self.bag is None) != (self.seen is None):
-            raise InputError.of("--bag and --seen belong together", fix="name both, or none")
-        if self.bag is not None and (self.once or self.stdin):
-            what = "--once and --stdin beside --bag, whose end is that of the campaign"
-            raise InputError.of(what, fix="leave them out")
 
 
 @command("record")

@@ -15,7 +15,7 @@ from diffeo_calib.common.errors import InputError
 
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
-DRAWN, FACING_HALF_ANGLE_DEG = 3000, 45.0
+DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
 AS_STORED = "by default as at the fit"
@@ -241,15 +241,10 @@ class Candidates:
         names=("--range",),
     )
     tracker: str | None = option(
-        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker.", "X,Y,Z"
-    )
-    facing: str | None = option(
-        "With --tracker: direction in which the marker looks, in the frame of the tip; 0,0,1 by default.", "X,Y,Z"
-    )
-    cone: float | None = option(
-        "With --tracker: largest angle in degrees between that direction and the line to the device, "
-        f"{FACING_HALF_ANGLE_DEG:g} by default.",
-        "DEG",
+        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker. Behind "
+        "it the direction in which the marker looks, in the frame of the tip (0,0,1), and the largest angle in degrees "
+        "between that and the line to the device (45).",
+        "X,Y,Z[,DX,DY,DZ[,DEG]]",
     )
     floor: float | None = option("Height in the base frame below which no link and no marker may be.", "Z")
     column: str | None = option(

@@ -13,11 +13,11 @@ ROWS = (
 TEXTS = {
     "fit": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
-        "--duplicates --figure --note --scales-of --report --jobs"
+        "--duplicates --figure --note --scales-of --report"
     ),
     "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines --bag --seen "
-        "--joint-states --speed --once --candidates --page --next --accepted"
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines "
+        "--once --candidates --page --next --accepted"
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
@@ -35,7 +35,7 @@ TEXTS = {
     ),
     "plan": (
         f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
-        "--candidates --target-poses --measured --draw --range --tracker --facing --cone --floor --column --collisions "
+        "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
         "--sensor --payload-mass"
     ),
     "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",
