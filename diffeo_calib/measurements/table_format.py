@@ -23,10 +23,26 @@ class TableFormat:
     """How a table of measurements or predictions is written.
 
     Args:
+        length: unit of the positions in the file. angle: of its revolute joints.
+        sep: one character between cells. decimal: ``"."`` or ``","``.
+        rotation: names of the columns of the tool's rotation, for measured poses, or one such list for each frame on
+            several tips, whose origins are the positions. Rotation and position map from the tool's frame to the
+            measuring frame.
+        convention: how all rotations are written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
+            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
+        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
+        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
+        std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
+            per marker or three per marker.
+        rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
+            which are not the axes of Euler angles: one for all, or one or three for each frame.
+        joint_length: unit of the prismatic joints in the file; that of the positions by default.
+        payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
+            For another link see :meth:`Measurements.with_payload`.
+        time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
+        camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
+            deviations are along its axes; see :meth:`Measurements.from_poses`.
         remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
-
-    The others are as in :func:`read_measurements`: units, marks, and names of columns, those of rotations None for a
-    table of points.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
