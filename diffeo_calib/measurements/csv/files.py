@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Values
 from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
@@ -230,16 +230,16 @@ def read_joints(
     Returns:
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
-    with open_joints(path, joints, table, kinds=kinds) as file:
-        return file.read()[0]["q"]
+    return read_configurations(path, joints, table, kinds=kinds)["q"]
 
 
-def open_joints(
+def read_configurations(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
     table: TableFormat,
     *,
     kinds: Sequence[str] | None = None,
-) -> TableFile:
-    """The same file as :func:`read_joints` reads, to be read in blocks."""
-    return TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
+) -> Values:
+    """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
+    with TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, [])) as file:
+        return file.read()[0]

@@ -1,10 +1,10 @@
-"""Tables of joint values and measurements, read in blocks of rows after all rows have been checked."""
+"""Tables of joint values and measurements, all of whose rows are checked together."""
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,29 +99,20 @@ MUCH_FARTHER = 3.0
 ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 
-Progress = Callable[[float], object]
-"""Called with the fraction of the file that has been read."""
-
 
 class TableFile(CsvLines):
     """A CSV file with columns in known units, used as a context.
-
-    It can be read as a whole (:meth:`read`), or in two passes for joint values that do not fit in memory: :meth:`check`
-    finds all mistakes and the number of rows; then :meth:`laden_joints` returns the rows.
 
     Args:
         path: the file.
         columns: which columns of numbers it has, and their units. texts: columns of texts, "nan" being empty, and
             whether it must have them.
-
-    Attributes:
-        rows: number of rows; 0 before the first pass.
     """
 
     def __init__(self, path: Path, columns: Columns, texts: Mapping[str, bool] = {}) -> None:  # not changed
         needed = [name for name, needed in texts.items() if needed]
         super().__init__(path, columns.table.sep, [*columns.names, *needed])
-        self.columns, self.texts, self.rows = columns, texts, 0
+        self.columns, self.texts = columns, texts
         self._words: dict[str, list[int]] = {}
 
     def read(self, *, zeros: bool = True) -> tuple[Values, dict[str, list[str]], list[int]]:
@@ -173,25 +164,6 @@ class TableFile(CsvLines):
             at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
             names = few([self.columns.names[k] for k in own.values[:3]])
             warn_user(f"file '{self.path}': {names} are 0, 0, 0 in line {at}, far from other rows: taken as not seen")
-
-    def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
-        """Find all mistakes, count the rows, and show blocks to ``each``; errors and warnings as in :meth:`read`."""
-        for block in self._checked():
-            if each is not None:
-                each(self.columns.to_si(block.numbers))
-            if progress is not None:
-                progress(self.progress)
-
-    def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """Joint values (B, n) [rad or m] of every block, and payloads (B,) if there are some, after :meth:`check`."""
-        count = 0
-        for block in self._numbers():
-            count += len(block.lines)
-            values = self.columns.to_si(block.numbers)
-            yield values["q"], values.get("payload")
-        if count != self.rows:
-            what, fix = f"file '{self.path}' changed while it was read", "run the command again"
-            raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
         """Numbers as written in the file, in blocks; MeasurementError for the first block with a mistake."""
@@ -265,7 +237,7 @@ class TableFile(CsvLines):
         """All blocks; what they have in common is checked after the last one."""
         columns, largest = self.columns, None
         checks = [group.check for group in columns.groups.values() for _ in group.names]
-        unseen, self.rows = columns.hideable, 0
+        unseen, count = columns.hideable, 0
         for block in self._numbers():
             raw = block.numbers
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
@@ -276,7 +248,7 @@ class TableFile(CsvLines):
                     bad = [(block.lines[row], name, f"{float(values[row]):g}") for row in wrong]
                     raise bad_cells(self.path, bad, check.expected, check.fix)
             unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
-            self.rows += len(block.lines)
+            count += len(block.lines)
             yield block
         notes = self.notes
         if self._words:
@@ -290,5 +262,5 @@ class TableFile(CsvLines):
                 warn_user(f"file '{self.path}': {text}")
         for own in unseen:
             names = few([columns.names[place] for place in own.values])
-            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave them out"
+            what, fix = f"file '{self.path}', columns {names}: empty in all {count} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
