@@ -18,7 +18,7 @@ from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-from diffeo_calib.kinematics.joint_ranges import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.writing import Column, Program
@@ -91,7 +91,8 @@ def run(options: CorrectOptions) -> None:
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
     sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
     sheet.check_free([tool.name("std", table.length) for tool in tools])
-    warn_outside_range(kinematics, start, refuse_other_unit=True)
+    refuse_other_angles(kinematics, start)
+    warn_outside_range(kinematics, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)

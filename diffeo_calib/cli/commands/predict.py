@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
-from diffeo_calib.kinematics.joint_ranges import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
@@ -54,7 +54,8 @@ def run(given: PredictOptions) -> None:
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     values = read_configurations(given.csv, names, table, kinds=robot.kinds)
     q, masses = values["q"], values.get("payload")
-    warn_outside_range(kinematics, q, refuse_other_unit=True)
+    refuse_other_angles(kinematics, q)
+    warn_outside_range(kinematics, q)
 
     def blocks() -> Iterator[Predictions]:
         """Predictions of some rows at a time."""
