@@ -107,8 +107,7 @@ class Live:
         numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
         found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
         found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
-        found |= {name: getattr(source.columns, name) for name in ("session", "sockets", "readings")}
-        found["position"] = [",".join(triple) for triple in source.columns.position or ()]
+        found["position"] = [",".join(triple) for triple in source.table.position or ()]
         found["joints"] = joint_columns(source.joints, robot)
         texts = {name: str(value) for name, value in found.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
@@ -262,7 +261,7 @@ class Live:
             entry["error_limit_mm"] = None if limit is None else 1e3 * limit
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
-        columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
+        columns = Columns.of(self.source.table.joints_only(names, robot.kinds))
         poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
         return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
 

@@ -37,7 +37,7 @@ from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
-from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.poses import numbers_of
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -107,9 +107,10 @@ class Source:
         markers = self.rows.markers or None
         session = self.rows.session if markers else None
         marker = None if self.marker is None else str(self.marker.value)
-        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds, marker=marker)
+        table = replace(table, joints=self.joints, kinds=self.robot.kinds, position=markers, sockets=sockets)
+        table = replace(table, readings=readings, session=session, marker=marker)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
-        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
+        data: Any = read_observations(self.csv, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
 

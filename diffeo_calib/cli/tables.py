@@ -29,7 +29,7 @@ from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
@@ -48,24 +48,22 @@ def table_format(units: Units) -> TableFormat:
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with columns of rotations, deviations, payloads and covariates; lever in the unit of length."""
+    """The same format with the columns that options name, but for readings; lever in the unit of length."""
     if rows.lever is not None and rows.rotation is None:
         raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
     if rows.camera_on_tool and rows.rotation is None and not rows.images:
         raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
+    as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
+        **{name: getattr(rows, name) for name in as_typed},
+        position=_position_triples(rows.position or []) or None,
         rotation=_names_of_each(rows.rotation),
-        convention=rows.convention,
-        rotation_angle=rows.rotation_angle,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
-        remounted=rows.remounted,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
-        payload=rows.payload,
-        time=rows.time,
-        temperature=rows.temperature,
+        sockets=socket_columns(rows.socket, rows.distance, rows.distance_std, table),
     )
 
 
@@ -77,10 +75,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
     readings = readings_columns(rows.reading or (), rows, _number_columns(csv, rows, table))
-    sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
-    triples = _position_triples(rows.position or []) or None
-    columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
-    return MeasuredTable(csv, units.joints, columns, table, duplicates)
+    return MeasuredTable(csv, units.joints, replace(table, readings=readings), duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -215,13 +210,12 @@ class MeasuredTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        columns: those of what was measured, whose joints are those of the robot that reads them.
-        table: the format. duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
+        table: what it holds, but for the joints, which are those of the robot that reads them.
+        duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
     """
 
     csv: Path
     joints: str | None
-    columns: TableColumns
     table: TableFormat
     duplicates: str = "keep"
     growing: bool = False
@@ -235,23 +229,24 @@ class MeasuredTable:
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
         """
-        given, triples = self.columns, self.columns.position
+        given, triples = self.table, self.table.position
         several = len(tips) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         session = given.session if triples or not given.readings else None  # of readings it names their devices
-        columns = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
-        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates, growing=self.growing)
-        if given.marker is not None and given.marker != data.origin.marker:  # later tables have the same order
+        table = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
+        data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
+        named = given.marker and data.origin.columns.table.marker
+        if given.marker != named:  # later tables have the same order
             say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
-            add_to_command_line(["--marker", data.origin.marker])
+            add_to_command_line(["--marker", named])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
-        if count and self.columns.session is None:
+        if count and self.table.session is None:
             what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
             fix = "name the column of the set-ups (--session), or leave these rows out"
             warn_user(sentence(f"{what}its frame", fix=fix))
@@ -288,11 +283,10 @@ class ProgramTable:
             fix = "name the columns of the targets once for every --tip"
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
-        table = with_rows(self.table, turned) if rotation else self.table
-        names, triples = joint_columns(self.joints, robot), _position_triples(position)
-        columns = TableColumns(names, triples, kinds=robot.kinds)
-        data = read_observations(self.csv, columns, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
-        lines = [line for line, _ in read_cells(self.csv, table.sep, columns.numeric(table).names)[1]]
+        table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
+        table = replace(table, joints=joint_columns(self.joints, robot), position=_position_triples(position))
+        data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
+        lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
             what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.lines.tolist()}))}"
             raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")

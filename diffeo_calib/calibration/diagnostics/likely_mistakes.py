@@ -196,14 +196,10 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
     in_tip = (geometry.marker_poses(data.q)[:, 0, :3, :3].cpu().mT @ error[:, :, None])[:, :, 0]
     for column, texts in data.origin.texts(data.line_numbers).items():
         names = list(dict.fromkeys(texts))
-        if not 1 < len(names) <= gates.MOST_MARKERS or column in {*columns.names, data.origin.session}:
+        if not 1 < len(names) <= gates.MOST_MARKERS or column in {*columns.names, columns.table.session}:
             continue
         rows = torch.tensor([[text == name for name in names] for text in texts], dtype=error.dtype, device=HOST)
-        if (
-            float(rows.sum(0).min()) < gates.MARKER_ROWS
-            or "" in names
-            or column in {*columns.names, data.origin.session}
-        ):
+        if float(rows.sum(0).min()) < gates.MARKER_ROWS or "" in names:
             continue
         means = [rows.mT @ own / rows.sum(0)[:, None] for own in (in_tip, error)]
         left = [float((own - rows @ mean).norm()) for own, mean in zip((in_tip, error), means, strict=True)]

@@ -193,7 +193,7 @@ class Plan:
 
     def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
-        columns = Columns.of(table.joints_only(), joints or self.joint_names, self.kinds, [])
+        columns = Columns.of(table.joints_only(joints or self.joint_names, self.kinds))
         devices = [[name] for name in self.devices] or [[]] * len(self)
         values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()
         rows = zip(values, self.rank.tolist(), devices, strict=True)

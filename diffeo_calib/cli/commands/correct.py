@@ -84,7 +84,7 @@ def run(options: CorrectOptions) -> None:
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
     robot, tools = kinematics.robot, _tools(kinematics, options, table)
-    columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
+    columns = Columns.of(table.joints_only(joint_columns(source.joints, robot), robot.kinds))
     sheet = Program.read(program, table, columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4

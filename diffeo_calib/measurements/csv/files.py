@@ -21,7 +21,15 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Values
-from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import (
+    FileRows,
+    ReadingColumns,
+    SensorColumns,
+    SocketColumns,
+    numeric_columns,
+    sensors_of,
+    text_columns,
+)
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
@@ -36,12 +44,7 @@ Rows = TypeVar("Rows", bound=RowGroups)
 
 @outside_inference_mode
 def read_observations(
-    path: str | PathLike[str],
-    columns: TableColumns,
-    table: TableFormat,
-    *,
-    duplicates: str = "error",
-    growing: bool = False,
+    path: str | PathLike[str], table: TableFormat, *, duplicates: str = "error", growing: bool = False
 ) -> Any:
     """Read a table whose rows may be of several kinds; units and errors are those of :func:`read_measurements`.
 
@@ -49,9 +52,8 @@ def read_observations(
     two kinds is two observations, and so two rows with the same line number.
 
     Args:
-        path: the file. columns: its columns. table: units, separator and decimal mark, columns of rotations, deviations
-            and payloads. duplicates: "error", "keep" or "drop". growing: whether rows will be added, so that none may
-            be judged by the others.
+        path: the file. table: what it holds. duplicates: "error", "keep" or "drop". growing: whether rows will be
+            added, so that none may be judged by the others.
 
     Returns:
         :class:`Measurements` of positions, poses, sockets, or positions and sockets; :class:`Readings` of one kind;
@@ -59,8 +61,8 @@ def read_observations(
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
-    sensors, numbers = columns.sensors, columns.numeric(table)
-    with TableFile(file, numbers, columns.texts) as whole:
+    sensors, numbers = sensors_of(table), numeric_columns(table)
+    with TableFile(file, numbers, text_columns(table)) as whole:
         rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
     tables = []
     for sensor, here in _divided(rows, sensors):
@@ -72,9 +74,10 @@ def read_observations(
     data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
     sha256 = file_sha256(file)
     data = data.with_file_sha256(sha256)
-    if rows.alone and columns.position is not None:
-        marker = columns.marker and f"{columns.marker.partition('=')[0]}={','.join(data.marker_names)}"
-        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session, marker))
+    if rows.alone and table.position is not None:
+        marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
+        numbers = replace(numbers, table=replace(numbers.table, marker=marker))
+        data = data.with_origin(TableOrigin(file, numbers, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
@@ -144,9 +147,8 @@ def read_measurements(
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         columns: all else that the table says, as fields of :class:`TableFormat` (``sep``, ``decimal``, ``rotation``,
-            ``convention``, ``rotation_angle``, ``std``, ``payload``, ...) and of :class:`TableColumns` (``session``,
-            ``marker``, ``kinds``, ``on``); and ``socket``, ``distances`` and ``distance_std``, the fields of
-            :class:`SocketColumns`.
+            ``convention``, ``rotation_angle``, ``std``, ``payload``, ``session``, ``marker``, ``on``, ...); and
+            ``socket``, ``distances`` and ``distance_std``, the fields of :class:`SocketColumns`.
 
     Returns:
         Measurements in rad and m, rows in the order of the file; of poses beside rows in sockets
@@ -160,30 +162,27 @@ def read_measurements(
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped; what was skipped.
     """
     known = {name: columns.pop(name, None) for name in ("socket", "distances", "distance_std")}
-    own = {name: columns.pop(name) for name in ("session", "kinds", "on", "marker") if name in columns}
-    sockets, socket, on = None, known.pop("socket"), own.get("on")
+    sockets, socket, on = None, known.pop("socket"), columns.get("on")
     if socket is not None:
         tip = None if not on or isinstance(on, str) else on[-1]
         sockets = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), **known, on=tip)
     elif any(value is not None for value in known.values()):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
-    table = TableFormat(length, angle, **columns)
-    return _read(path, TableColumns(robot, position, sockets, **own), table, duplicates, joints)
+    table = TableFormat(length, angle, **columns, joints=robot, position=position, sockets=sockets)
+    return _read(path, table, duplicates, joints)
 
 
-def _read(
-    path: str | PathLike[str], columns: TableColumns, table: TableFormat, duplicates: str, joints: Sequence[str] | None
-) -> Any:
-    """Read columns, whose joints may have other names in the file than in the robot."""
-    robot = columns.joints
+def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints: Sequence[str] | None) -> Any:
+    """Read a table, whose joints may have other names in the file than in the robot."""
+    robot = table.joints
     if joints is None:
-        return read_observations(path, columns, table, duplicates=duplicates)
+        return read_observations(path, table, duplicates=duplicates)
     names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
     if len(names) != len(joints):
         got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
         raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
-    columns = replace(columns, joints=joints, kinds=columns.kinds or kinds)
-    return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
+    table = replace(table, joints=joints, kinds=table.kinds or kinds)
+    return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
 
 
 @outside_inference_mode
@@ -194,14 +193,13 @@ def read_readings(
     kind: str = "distance",
     *,
     joints: Sequence[str] | None = None,
-    kinds: Sequence[str] | None = None,
     duplicates: str = "error",
     **columns: Any,
 ) -> Readings:
     """Read a table of distances, heights or places in images from a CSV file, in SI.
 
     Args:
-        path, robot, joints, kinds, duplicates: as in :func:`read_measurements`.
+        path, robot, joints, duplicates: as in :func:`read_measurements`.
         values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
         kind: "distance", "height" or "image".
         columns: fields of :class:`ReadingColumns` (``std``, ``offset_std``, ``intrinsics``, ``on``, ``session``, the
@@ -212,7 +210,7 @@ def read_readings(
     check_choice("kind", kind, ("distance", "height", "image"))
     given = {name: columns.pop(name) for name in ("std", "offset_std", "intrinsics", "on") if name in columns}
     own = ReadingColumns.checked(kind, values, device=columns.pop("session", None), **given)
-    return _read(path, TableColumns(robot, readings=(own,), kinds=kinds), TableFormat(**columns), duplicates, joints)
+    return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 
 def read_joints(
@@ -241,5 +239,5 @@ def read_configurations(
     kinds: Sequence[str] | None = None,
 ) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    with TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, [])) as file:
+    with TableFile(Path(path), Columns.of(table.joints_only(joints, kinds))) as file:
         return file.read()[0]

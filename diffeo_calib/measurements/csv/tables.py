@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -38,33 +38,29 @@ class TableOrigin:
         path: the file.
         columns: which of its columns were read, and how.
         sha256: of its content; None for what can be read only once, such as a pipe.
-        session: column of the set-ups. marker: column that names the marker of each line, "=" and the names in order.
     """
 
     path: Path
     columns: Columns
     sha256: str | None
-    session: str | None = None
-    marker: str | None = None
 
     @property
     def options(self) -> str:
         """The options with which the command line reads this table, as a shell would take them."""
         columns, table = self.columns, self.columns.table
-        frames = max(len(columns.triples), 1)
-        words = [word for triple in columns.triples for word in ("--position", ",".join(triple))]
-        for option, names in (("--rotation", columns.rotation), ("--rotation-std", columns.rotation_std)):
-            each = len(names) // frames or len(names)
-            own = [names[k : k + each] for k in range(0, len(names), each or 1)]
-            words += [word for group in own for word in (option, ",".join(group))]
         lever = f"{table.lever * table.per_metre:.17g}" if columns.rotation and table.lever != LEVER else None
-        one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
-        one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
-        one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints.texts)}
-        one |= {**table.covariates, "session": self.session, "marker": self.marker}
-        one |= {"sep": table.sep, "decimal": table.decimal}
-        words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
-        return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
+        texts = {field.name: getattr(table, field.name) for field in fields(table)} | {"lever": lever}
+        texts |= {"position": table.triples, "std": ",".join(columns.std), "joints": ",".join(columns.joints.texts)}
+        words = list[str]()
+        for name, value in texts.items():
+            if value and name not in ("kinds", "on", "sockets", "readings"):
+                option = f"--{name.replace('_', '-')}"
+                if value is True:
+                    words.append(option)
+                    continue
+                each = [value] if isinstance(value, str) else map(",".join, value)
+                words += [word for text in each for word in (option, text)]
+        return shlex.join(words)
 
     def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.
