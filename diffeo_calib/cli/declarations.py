@@ -25,7 +25,6 @@ from diffeo_calib.cli.options import (
     Places,
     Robot,
     Rows,
-    StoredUnits,
     Targets,
     Units,
     argument,
@@ -142,7 +141,7 @@ class EvaluateOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     rows: Rows
     register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
     free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
@@ -215,7 +214,7 @@ class PredictOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     output: Path = output("Table of predictions to write.", "CSV")
     convention: str | None = option(CONVENTION)
     rotation_angle: Angle | None = option(ROTATION_ANGLE)
@@ -241,7 +240,7 @@ class CorrectOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     program: Path = argument("PROGRAM", "Table with a header, one command per row; other columns are kept.")
-    units: StoredUnits
+    units: Units
     output: Path = output("Corrected program to write.", "CSV")
     targets: Targets
     tip: list[str] | None = option(
@@ -347,7 +346,7 @@ class PlanOptions(Command):
     """
 
     count: int = option("Number of poses to plan.", names=("-n", "--count"), min=1, default=...)
-    units: StoredUnits
+    units: Units
     output: Path = output("Table of poses to write: the joints, and a rank.", "CSV")
     cell: Candidates
     model: Path | None = argument(
@@ -402,7 +401,7 @@ class RecalibrateOptions(Command):
 
     old: Path = argument("OLD", "Model file of an earlier calibration.")
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     output: Path = output("Model file to write.", "MODEL")
     rows: Rows
     drift: Literal["tested", "none"] = option(
@@ -425,7 +424,7 @@ class CompareOptions(Command):
 
     old: Path = argument("OLD", "Model file of an earlier calibration.")
     other: Path = argument("OTHER", "Table of new measurements, or another model file of the same robot.")
-    units: StoredUnits
+    units: Units
     rows: Rows
     level: float = option(
         "Probability that anything is named although nothing changed.", min=0.001, max=0.2, default=0.01
@@ -444,7 +443,7 @@ class ReportOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     output: Path = output("Page to write.", "HTML")
-    units: StoredUnits
+    units: Units
     rows: Rows
     data: Path | None = option(
         "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"

@@ -18,7 +18,7 @@ LARGEST_SEED = 2**63 - 1
 DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
-AS_STORED = "by default as at the fit"
+KNOWN = "later commands know it"
 
 
 def option(
@@ -85,25 +85,15 @@ LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredUnits:
-    """How tables are written, for commands with a model, which may know it."""
+class Units:
+    """How tables are written; a model knows that of the table of its fit."""
 
-    length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
-    angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
+    length: Length | None = option(f"{LENGTH}; {KNOWN}.")
+    angle: Angle | None = option(f"{ANGLE}; {KNOWN}.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
     joints: str | None = option(JOINTS, "A,B,...")
-    sep: str | None = option(f"{SEP}, {AS_STORED}.")
-    decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Units(StoredUnits):
-    """The same where units must be stated."""
-
-    length: Length = option(f"{LENGTH}.", default=...)
-    angle: Angle = option(f"{ANGLE}.", default=...)
-    sep: str = option(f"{SEP}.", default=",")
-    decimal: str = option(f"{DECIMAL}.", default=".")
+    sep: str | None = option(f"{SEP}, by default a comma; {KNOWN}.")
+    decimal: str | None = option(f"{DECIMAL}, by default a point; {KNOWN}.")
 
 
 @dataclass(frozen=True, kw_only=True)

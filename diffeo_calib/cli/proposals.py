@@ -101,14 +101,14 @@ class Source:
 
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
-        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
+        session = self.rows.named.get("session")
+        options = Rows(session=session, camera_on_tool=table.camera_on_tool)
         readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
         sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
         markers = self.rows.markers or None
-        session = self.rows.session if markers else None
         marker = None if self.marker is None else str(self.marker.value)
         table = replace(table, joints=self.joints, kinds=self.robot.kinds, position=markers, sockets=sockets)
-        table = replace(table, readings=readings, session=session, marker=marker)
+        table = replace(table, readings=readings, session=session if markers else None, marker=marker)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
         data: Any = read_observations(self.csv, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -22,7 +22,7 @@ from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line, leaves_of, names_of
 from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
+from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
@@ -42,9 +42,19 @@ KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 
 
 def table_format(units: Units) -> TableFormat:
-    """The format of a table of points; the separator may be a tab written as \\t or tab."""
-    mark = "\t" if units.sep in ("\\t", "tab") else units.sep
-    return TableFormat(units.length, units.angle, mark, units.decimal, joint_length=units.joint_length)
+    """The format of a table of points; the separator may be a tab written as \\t or tab.
+
+    InputError for a unit that is neither typed nor kept with the model.
+    """
+    length, angle, sep = units.length, units.angle, "," if units.sep is None else units.sep
+    if length is None or angle is None:
+        missing = " and ".join(f"--{name}" for name in ("length", "angle") if getattr(units, name) is None)
+        fix = "state the units of the table; a model that `fit` made knows those of its own"
+        raise InputError.of(f"{missing} missing", fix=fix)
+    mark = "\t" if sep in ("\\t", "tab") else sep
+    return TableFormat(
+        length, angle, mark, "." if units.decimal is None else units.decimal, joint_length=units.joint_length
+    )
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
@@ -105,7 +115,7 @@ def check_place(rows: Rows) -> None:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
@@ -134,7 +144,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return completed[0], stated_units(completed[1])
+    return completed
 
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
@@ -157,22 +167,12 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     return replace(rows, reading=kept or None, **changes), missing
 
 
-def stated_units(units: StoredUnits) -> Units:
-    """Units that are known; InputError for one that is neither typed nor kept with the model."""
-    missing = [f"--{name}" for name in ("length", "angle") if getattr(units, name) is None]
-    if missing:
-        fix = "state the units of the table; a model that `fit` made knows those of its own"
-        raise InputError.of(f"{' and '.join(missing)} missing", fix=fix)
-    given = {name: value for name, value in asdict(units).items() if value is not None}
-    return Units(**given)
-
-
-def _options_of(group: type[StoredUnits] | type[Rows]) -> dict[str, tuple[str, Any]]:
+def _options_of(group: type[Units] | type[Rows]) -> dict[str, tuple[str, Any]]:
     """Option -> name and type of its field."""
     return {names_of(field)[0]: (name, hint) for name, (hint, field) in leaves_of(group)}
 
 
-def _read_options(words: Sequence[str], group: type[StoredUnits] | type[Rows]) -> dict[str, list[str]]:
+def _read_options(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, list[str]]:
     """Option of a group -> its words in a command line."""
     found: dict[str, list[str]] = {}
     options = _options_of(group)

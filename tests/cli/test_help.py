@@ -89,7 +89,6 @@ def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command)
     assert "[required]" in found["--robot"]
     assert "[required]" in found["CSV"]
     assert "required" not in found["--joints"]
-    assert "[default: ,]" in found["--sep"]
     assert "default: 0.3" in found["--holdout"]
     assert "0.0<=x<=0.9" in found["--holdout"]
     assert "<m|mm|cm|inch>" in command("fit", "--help").out

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_R
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
+from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Source
@@ -42,8 +42,7 @@ NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
-COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "session", "payload", "reading", "by")
-COLUMNS = (*COLUMNS, "time", "temperature")
+COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED)
 """Entries that name columns."""
 
 

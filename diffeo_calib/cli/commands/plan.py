@@ -20,7 +20,7 @@ from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, plan
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
+from diffeo_calib.cli.tables import joint_columns, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -61,7 +61,7 @@ def run(given: PlanOptions) -> None:
     cell, count, output = given.cell, given.count, given.output
     with exit_on_interrupt(), progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
-        stated = stated_units(given.units) if model is None else as_fitted(model, None, given.units)[1]
+        stated = given.units if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
         source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
