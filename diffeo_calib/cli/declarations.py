@@ -150,13 +150,8 @@ class EvaluateOptions(Command):
         "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
     )
     residuals: Path | None = written("Write the error of every row to this file: measured minus predicted.", "TABLE")
-
-    def check(self) -> None:
-        if not self.register and not (self.free is None and self.output is None):
-            raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
-        if self.register and not (self.fail_above is None and self.residuals is None):
-            fix = "write the registered model with -o, and evaluate that"
-            raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
+    needs = dict.fromkeys(("--free", "-o"), "--register")
+    beside = dict.fromkeys(("--fail-above", "--residuals"), "--register")
 
 
 @command("init")
@@ -310,6 +305,11 @@ class ExportOptions(Command):
     payload_mass: float | None = option(MASS, "MASS")
     length: Length = option("Unit of lengths in the CSV files written.", default="m")
     angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
+    needs = dict.fromkeys(("--tool", "--frame"), "--c --torch --onnx") | {
+        "--with-tables": "--urdf --mjcf --dh --ur-kinematics",
+        "--ur-hash": "--ur-kinematics",
+        "--tip": "--c --dh",
+    }
 
     @property
     def outputs(self) -> dict[str, Path | None]:
@@ -318,7 +318,7 @@ class ExportOptions(Command):
         return {f"--{field.name.replace('_', '-')}": getattr(self, field.name) for field in own}
 
     @property
-    def beside(self) -> dict[str, Path]:
+    def more_files(self) -> dict[str, Path]:
         """The header of C."""
         return {} if self.c is None else {"--c (its header)": self.c.with_suffix(".h")}
 
@@ -326,15 +326,8 @@ class ExportOptions(Command):
         wanted = {option for option, target in self.outputs.items() if target is not None}
         if not wanted:
             raise typer.BadParameter(f"name at least one file to write: {', '.join(self.outputs)}")
-        rigid = {"--urdf", "--dh", "--ur-kinematics"}
-        if self.with_tables and not ("--correction-tables" in wanted and wanted & rigid):
-            raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
-        if self.ur_hash is not None and "--ur-kinematics" not in wanted:
-            raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
-        if self.tip and not wanted & {"--c", "--dh"}:
-            raise typer.BadParameter("--tip belongs to --c and --dh: the other files hold all tips")
-        if (self.tool or self.frame) and not wanted & {"--c", "--torch", "--onnx"}:
-            raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")
+        if self.with_tables and self.correction_tables is None:
+            raise InputError.of("--with-tables without --correction-tables", fix="name both, or none")
 
 
 @command("plan")
@@ -372,21 +365,13 @@ class PlanOptions(Command):
         "KIND[=NUMBERS]",
     )
     payload_mass: float | None = option(MASS, "MASS")
+    needs = dict.fromkeys(("--payload-mass", "--free"), "MODEL")
+    beside = dict.fromkeys(("--robot", "--base", "--tip", "--load", "--dh-convention", "--marker"), "MODEL")
+    beside |= dict.fromkeys(("--draw", "--range", "--tracker", "--floor", "--column", "--collisions"), "--candidates")
 
     def check(self) -> None:
-        known = {"robot": self.robot, **vars(self.links), "marker": self.marker}
-        named = [f"--{name.replace('_', '-')}" for name, value in known.items() if value is not None]
-        if self.model is not None and named:
-            fix = "leave them out: the model knows its robot and its markers"
-            raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)
         if self.model is None and self.robot is None:
             raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
-        if self.model is None and self.payload_mass is not None:
-            fix = "leave it out: no sag under a payload is known yet"
-            raise InputError.of("--payload-mass without a MODEL", fix=fix)
-        if self.model is None and self.free is not None:
-            raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
-        self.cell.check()
 
 
 @command("recalibrate")
@@ -457,11 +442,7 @@ class ReportOptions(Command):
     tolerance: str | None = option(
         "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
     )
-
-    def check(self) -> None:
-        if self.data is None and (self.rows.named or self.units.length or self.units.angle or self.against):
-            what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
-            raise InputError.of(what, fix="name the table with --data, or leave them out")
+    needs = dict.fromkeys(("--position", "--socket", "--reading", "--length", "--angle", "--against"), "--data")
 
 
 @command("demo")

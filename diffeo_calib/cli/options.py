@@ -11,8 +11,6 @@ from typing import Any, Literal
 
 import typer
 
-from diffeo_calib.common.errors import InputError
-
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
 DRAWN = 3000
@@ -245,15 +243,6 @@ class Candidates:
         default=False,
     )
     seed: int = option("Seed of the random candidates.", min=0, max=LARGEST_SEED, default=0)
-
-    def check(self) -> None:
-        """Refuse options of random configurations beside a table of candidates."""
-        drawing = {"draw": self.draw, "range": self.limits, "tracker": self.tracker, "floor": self.floor}
-        drawing |= {"column": self.column, "collisions": self.collisions or None}
-        given = [f"--{name}" for name, value in drawing.items() if value is not None]
-        if self.candidates is not None and given:
-            what = f"{', '.join(given)} beside --candidates: these options are about random configurations"
-            raise InputError.of(what, fix="leave them out, or leave --candidates out")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, leaves_of, names_of
+from diffeo_calib.cli.app import add_to_command_line, check_together, leaves_of, names_of, typed_options
 from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
@@ -39,6 +39,9 @@ from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
+NEEDS = {"--lever": "--rotation", "--camera-on-tool": "--rotation --reading", "--places": "--by", "--by": "--places"}
+NEEDS |= {"--distance-std": "--socket", "--distance": "--distance-std"}
+"""Options of rows, and those of which they need one."""
 
 
 def table_format(units: Units) -> TableFormat:
@@ -59,10 +62,7 @@ def table_format(units: Units) -> TableFormat:
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """The same format with the columns that options name, but for readings; lever in the unit of length."""
-    if rows.lever is not None and rows.rotation is None:
-        raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
-    if rows.camera_on_tool and rows.rotation is None and not rows.images:
-        raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
+    check_together(typed_options(dict(leaves_of(Rows)), vars(rows)), NEEDS, {})
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
@@ -90,26 +90,16 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
     """The table, joined with that of the measured places if there is one."""
-    if (rows.places is None) != (rows.by is None):
-        fix = "--places names the file of the measured places, --by a column of both files"
-        raise InputError.of("--places and --by belong together", fix=fix)
     if rows.places is None or rows.by is None:
         return csv
     return joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
 
 
 def check_place(rows: Rows) -> None:
-    """Raise an error unless positions, sockets or readings are named, or for distances without sockets."""
+    """Raise an error unless positions, sockets or readings are named."""
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    if rows.socket is None and (rows.distance or rows.distance_std is not None):
-        raise InputError.of("--distance without --socket", fix="name the columns of the sockets too")
-    if rows.distance and rows.distance_std is None:
-        fix = (
-            "say how well the distances are known, in the unit of --length: 0.03 mm for a block measured with a caliper"
-        )
-        raise InputError.of("--distance without --distance-std", fix=fix)
 
 
 # --- as at the fit ------------------------------------------------------------------------------------------------

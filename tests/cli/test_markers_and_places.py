@@ -126,8 +126,8 @@ def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Comman
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fit", "JOINTS", "--places", "PLACES"], "--places and --by belong together"),
-        (["fit", "JOINTS", "--by", "name"], "--places and --by belong together"),
+        (["fit", "JOINTS", "--places", "PLACES"], "--places without --by"),
+        (["fit", "JOINTS", "--by", "name"], "--by without --places"),
         (["campaign", "JOINTS", "--places", "PLACES", "--by", "name"], "--places or --marker, of a table that grows"),
         (["campaign", "WHOLE", "--marker", "reflector"], "--places or --marker, of a table that grows"),
         (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "`marker` (reflector): expected one position"),

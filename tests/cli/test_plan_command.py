@@ -74,9 +74,9 @@ def test_next_poses_and_poses_to_measure_again(
     ("options", "message"),
     [
         ([], "what to plan for: expected a MODEL, or --robot, got neither"),
-        (["MODEL", "--base", "x"], "--base beside a MODEL"),
-        (["MODEL", "--marker", "0,0,1"], "--marker beside a MODEL"),
-        (["ROBOT", "--free", "base"], "--free without a MODEL"),
+        (["MODEL", "--base", "x"], "--base beside MODEL"),
+        (["MODEL", "--marker", "0,0,1"], "--marker beside MODEL"),
+        (["ROBOT", "--free", "base"], "--free without MODEL"),
         (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 or 6 or 7 numbers"),
         (["ROBOT", "--column", "1,2"], "--column 1,2: expected 3 or 4 numbers"),
         (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
