@@ -227,7 +227,7 @@ class MeasuredTable:
         session = given.session if triples or not given.readings else None  # of readings it names their devices
         table = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
         data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
-        named = given.marker and data.origin.columns.table.marker
+        named: Any = given.marker and data.origin.columns.table.marker
         if given.marker != named:  # later tables have the same order
             say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
             add_to_command_line(["--marker", named])

@@ -103,7 +103,7 @@ def run(options: CorrectOptions) -> None:
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     allowed = found.q.isfinite().all(1)
     known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
-    sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
+    sheet.write(output, columns.from_si({"q": found.q}) | _added(kinematics, found, tools, known, table), table)
     misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
     record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)

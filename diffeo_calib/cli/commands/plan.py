@@ -116,7 +116,8 @@ def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
     found: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
     if cell.tracker is not None:
         x, y, z, *seen = _numbers("--tracker", cell.tracker, (3, 6, 7))
-        how = dict(zip(("direction", "half_angle"), (seen[:3], *map(radians, seen[3:])), strict=False)) if seen else {}
+        looks = (seen[:3], *map(radians, seen[3:])) if seen else ()
+        how: dict[str, Any] = dict(zip(("direction", "half_angle"), looks, strict=False))
         found["tracker"] = Tracker((x / scale, y / scale, z / scale), **how)
     if cell.column is not None:
         found["column"] = [x / scale for x in _numbers("--column", cell.column, (3, 4))]

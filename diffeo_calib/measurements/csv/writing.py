@@ -16,9 +16,9 @@ from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
-from diffeo_calib.common.files import WholeFile, write_whole
+from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import Columns, Group, check_count
+from diffeo_calib.measurements.csv.columns import check_count
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import (
@@ -45,11 +45,10 @@ def write_predictions(
     blocks: Iterable[Predictions],
     table: TableFormat,
     *,
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
     prefixes: Sequence[str] = ("",),
     more: Sequence[str] = (),
     poses: bool = False,
+    **columns: Any,
 ) -> None:
     """Write configurations, predicted markers or poses and their standard deviations; overwrites.
 
@@ -62,35 +61,31 @@ def write_predictions(
             deviations (B, P, 3), m, or (B, 6) or (B, T, 6): of positions, m, and of rotations about the measuring
             frame's axes, rad; and more cells (B, k) as they are written.
         table: the format, of poses with defaults as in :func:`write_measurements`.
-        joints: names of the joint columns.
-        kinds: kind of every joint; all revolute by default.
         prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
-        poses: whether the blocks hold poses.
+        poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
 
     Raises:
         MeasurementError: unknown unit or convention.
         InputError: a file that cannot be written.
     """
-    columns, count = Columns.of(table.joints_only(joints, kinds)), len(prefixes)
-    names, turned = list(columns.joints.columns), [()] * count
-    if poses:
-        table = table.for_writing(rotation_std=True, prefixes=prefixes)
-        turns, deviations = (flat_names(own) for own in (table.rotation, table.rotation_std))
-        each = len(turns) // count
-        turned = [turns[each * k : each * (k + 1)] + deviations[3 * k : 3 * (k + 1)] for k in range(count)]
-    for prefix, own in zip(prefixes, turned, strict=True):
-        names += [*(f"{prefix}{std}{axis}" for std in ("", "std_") for axis in "xyz"), *own]
+    table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
+    table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
+    numeric = numeric_columns(table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table)
+    table, names = numeric.table, [*numeric.joints.columns]
+    turned = zip(table.rotation or (), table.rotation_std or (), strict=True) if poses else [((), ())] * len(prefixes)
+    for k, (triple, (turns, deviations)) in enumerate(zip(numeric.triples, turned, strict=True)):
+        names += [*triple, *numeric.std[3 * k : 3 * k + 3], *turns, *deviations]
 
-    def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
-        frames = by_frame(mean) if poses else None
-        places = mean if frames is None else frames[..., :3, 3]
-        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), count, -1)
-        for k in range(count):
-            parts.append(Group((), table.length).from_si(torch.cat([places[:, k], spreads[:, k, :3]], dim=1)))
-            if frames is not None and table.convention is not None and table.rotation_angle is not None:
-                turns = visible_rotation_numbers(frames[:, k : k + 1], table.convention, table.rotation_angle)
-                parts += [turns.flatten(1).cpu(), Group((), table.rotation_angle).from_si(spreads[:, k, 3:])]
-        return torch.cat([*parts, *others], dim=1)
+    def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
+        frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
+        values = {"q": q, "points": mean if frames is None else frames[..., :3, 3], "std": spreads[..., :3]}
+        if frames is not None:
+            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
+            values |= {"rotations": numbers, "rotation_std": spreads[..., 3:]}
+        cells = numeric.from_si(values)
+        beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
+        lines = zip(*(cells[name] for name in names), strict=True)
+        return [[*line, *own] for line, own in zip(lines, beside, strict=True)]
 
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
@@ -152,28 +147,19 @@ class Program:
             what = f"the program already has the column(s) {listed(taken)}, which the output adds"
             raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
 
-    def write(self, path: Path, q: Tensor, joints: Columns, added: Mapping[str, Column], table: TableFormat) -> None:
-        """Write the program with other joint values and more columns; overwrites.
+    def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
+        """Write the program with other and more columns; overwrites.
 
         Args:
-            path: the file.
-            q: (N, n) joint values, rad and m; NaN becomes an empty cell.
-            joints: their columns.
-            added: names and values of the columns to add, numbers in the units of the file.
-            table: units, separator and decimal mark.
+            path: the file. cells: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
+            table: separator and decimal mark.
 
         Raises:
             InputError: a file that cannot be written.
         """
-        values = joints.joints_from_si(q).tolist()
-        places = [self.header.index(name) for name in joints.joints.columns]
-        lines = [[*self.header, *added]]
-        for row, cells in enumerate(self.rows):
-            line = list(cells)
-            for place, value in zip(places, values[row], strict=True):
-                line[place] = _cell(value, table)
-            lines.append([*line, *(_cell(column[row], table) for column in added.values())])
-        write_whole(path, csv_text(lines, table.sep))
+        added = {name: own for name, own in cells.items() if name not in self.header}
+        kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
+        write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
 
 
 def _cell(value: str | float, table: TableFormat) -> str:
