@@ -6,7 +6,7 @@ Units exist only in files. They must always be named and are never guessed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
@@ -193,6 +193,21 @@ class TableFormat:
             raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
         if unit is not None:
             check_choice("rotation_angle", unit, ANGLE_UNITS)
+
+
+def options_of(table: TableFormat) -> list[str]:
+    """The options with which the command line reads positions or poses that are written so, word by word."""
+    lever = f"{table.lever * table.per_metre:.17g}" if table.rotation and table.lever != LEVER else None
+    texts = {field.name: getattr(table, field.name) for field in fields(table)}
+    texts |= {"position": table.triples, "lever": lever, "joints": ",".join(table.joints)}
+    texts |= {"std": ",".join(flat_names(table.std))}
+    words = list[str]()
+    for name, value in texts.items():
+        if value and name not in ("kinds", "on", "sockets", "readings"):
+            option = f"--{name.replace('_', '-')}"
+            each = [value] if isinstance(value, str) else [] if value is True else map(",".join, value)
+            words += [option] if value is True else [word for text in each for word in (option, text)]
+    return words
 
 
 def flat_names(names: Names | None) -> tuple[str, ...]:

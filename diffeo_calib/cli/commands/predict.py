@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -24,7 +25,7 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
-from diffeo_calib.measurements.table_format import TableFormat, flat_names
+from diffeo_calib.measurements.table_format import TableFormat, options_of
 
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
@@ -90,13 +91,11 @@ def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> tupl
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    options = []
-    for prefix in prefixes:
-        written = table.for_writing(rotation_std=False, prefixes=[prefix])
-        columns = flat_names(written.rotation)
-        unit = f" --rotation-angle {written.rotation_angle}" * (len(columns) == 3)
-        options += [f"--position {','.join(prefix + axis for axis in 'xyz')} --rotation {','.join(columns)}"]
-    return f"{' '.join(options)} --convention {written.convention}{unit}"
+    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), table.joints_only(())
+    position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
+    turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
+    none = dict.fromkeys(("payload", "time", "temperature"))
+    return shlex.join(options_of(replace(units, position=position, **turned, **none)))
 
 
 def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, masses: Tensor | None) -> Predictions:

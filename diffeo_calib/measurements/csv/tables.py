@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,8 @@ from diffeo_calib.measurements.csv.cells import (
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
-from diffeo_calib.measurements.poses import ANGLE_UNITS, LEVER
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.poses import ANGLE_UNITS
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, options_of
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,7 @@ class TableOrigin:
     @property
     def options(self) -> str:
         """The options with which the command line reads this table, as a shell would take them."""
-        columns, table = self.columns, self.columns.table
-        lever = f"{table.lever * table.per_metre:.17g}" if columns.rotation and table.lever != LEVER else None
-        texts = {field.name: getattr(table, field.name) for field in fields(table)} | {"lever": lever}
-        texts |= {"position": table.triples, "std": ",".join(columns.std), "joints": ",".join(columns.joints.texts)}
-        words = list[str]()
-        for name, value in texts.items():
-            if value and name not in ("kinds", "on", "sockets", "readings"):
-                option = f"--{name.replace('_', '-')}"
-                if value is True:
-                    words.append(option)
-                    continue
-                each = [value] if isinstance(value, str) else map(",".join, value)
-                words += [word for text in each for word in (option, text)]
-        return shlex.join(words)
+        return shlex.join(options_of(replace(self.columns.table, joints=self.columns.joints.texts)))
 
     def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.
