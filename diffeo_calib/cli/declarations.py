@@ -411,11 +411,7 @@ class CompareOptions(Command):
     other: Path = argument("OTHER", "Table of new measurements, or another model file of the same robot.")
     units: Units
     rows: Rows
-    level: float = option(
-        "Probability that anything is named although nothing changed.", min=0.001, max=0.2, default=0.01
-    )
     tests: ChangeTests
-    figure: Path | None = written("With a model: draw where the two differ.", "IMAGE")
 
 
 @command("report")
@@ -433,7 +429,6 @@ class ReportOptions(Command):
     data: Path | None = option(
         "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
     )
-    title: str = option("Title of the page; the robot by default.", "TEXT", default="")
     against: list[str] | None = option(
         "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
         "names.",

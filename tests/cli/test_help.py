@@ -39,8 +39,8 @@ TEXTS = {
         "--sensor --payload-mass"
     ),
     "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",
-    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --level --seed --figure",
-    "report": f"{ROWS} {UNITS} MODEL -o --output --data --title --against --tolerance",
+    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --seed",
+    "report": f"{ROWS} {UNITS} MODEL -o --output --data --against --tolerance",
     "demo": "-o --output --rows --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
