@@ -165,7 +165,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 guessed = guess_joints(sheet.numbers, chain.joint_names) or [JointColumns(arm.columns, arm.how, ())]
                 seen, names = proposals.joint_columns(seen, guessed)
                 seen = proposals.measured(seen)
-                seen = replace(seen, marker=proposals.marker(seen, sheet))
+                seen = replace(seen, marker=proposals.marker(seen))
                 units = list(_units(seen))
                 meant = [choice for choice in units if choice.name == "joints"]
                 names = meant or names
@@ -173,7 +173,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 units = [choice for choice in units if choice.name != "joints"]
                 if meant:  # the robot explains the rows only now
                     seen = proposals.measured(seen)
-                    seen = replace(seen, marker=seen.marker or proposals.marker(seen, sheet))
+                    seen = replace(seen, marker=seen.marker or proposals.marker(seen))
                 one = _with_tip(robot, Explained(arm, "", seen, names, units))
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
