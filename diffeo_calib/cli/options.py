@@ -16,7 +16,6 @@ LARGEST_SEED = 2**63 - 1
 DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
-KNOWN = "later commands know it"
 
 
 def option(
@@ -74,24 +73,23 @@ PAYLOAD = "Column with the known mass that the robot carried, in any unit."
 
 # --- how a table is written ---------------------------------------------------------------------------------------
 
-SEP, DECIMAL = "Column separator of the table ('\\t' for a tab)", "Decimal mark of the table"
-JOINTS = (
-    "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of the "
-    "table, such as -{J2}+90 or {J3}+{J2}."
-)
-LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit of revolute joints in the table"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Units:
     """How tables are written; a model knows that of the table of its fit."""
 
-    length: Length | None = option(f"{LENGTH}; {KNOWN}.")
-    angle: Angle | None = option(f"{ANGLE}; {KNOWN}.")
+    length: Length | None = option(
+        "Unit of positions in the table, and of prismatic joints; needed where no model knows it."
+    )
+    angle: Angle | None = option("Unit of revolute joints in the table; needed where no model knows it.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
-    joints: str | None = option(JOINTS, "A,B,...")
-    sep: str | None = option(f"{SEP}, by default a comma; {KNOWN}.")
-    decimal: str | None = option(f"{DECIMAL}, by default a point; {KNOWN}.")
+    joints: str | None = option(
+        "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of "
+        "the table, such as -{J2}+90 or {J3}+{J2}.",
+        "A,B,...",
+    )
+    sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")
+    decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
 
 
 @dataclass(frozen=True, kw_only=True)

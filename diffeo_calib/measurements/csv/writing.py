@@ -90,12 +90,7 @@ def write_predictions(
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
 
-def write_rows(
-    path: str | PathLike[str],
-    names: Sequence[str],
-    blocks: Iterable[Tensor | Cells],
-    table: TableFormat,
-) -> None:
+def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:
     """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
 
     Texts are written as they are, NaN becomes an empty cell.
@@ -103,8 +98,7 @@ def write_rows(
     with WholeFile(path) as file:
         file.write(csv_text([names], table.sep))
         for block in blocks:
-            rows = block.tolist() if isinstance(block, Tensor) else block
-            file.write(csv_text(([_cell(value, table) for value in row] for row in rows), table.sep))
+            file.write(csv_text(([_cell(value, table) for value in row] for row in block), table.sep))
 
 
 def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
