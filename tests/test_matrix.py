@@ -40,7 +40,6 @@ import diffeo_calib as dc
 from diffeo_calib.cli import record
 from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.sensors import TableColumns
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -463,9 +462,7 @@ def _(bench: Bench) -> None:
 @verb("read and write")
 def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "table.csv"
-    columns, table = kind.written(kind.data, path)
-    same: Any = read_observations(path, columns, table)
-    assert isinstance(columns, TableColumns)
+    same: Any = read_observations(path, kind.written(kind.data, path))
     assert type(same) is type(kind.data)
     check_same_rows(same, kind.data)
 

@@ -129,10 +129,10 @@ class Campaign:
         turned = turned if self.design.kind in ("poses", "board poses", "inclinations") else {}
         on_tool = self.design.kind in ("board poses", "board images") and self.design.number % 2 == 0
         form = TableFormat("mm", "deg", joint_length="m", camera_on_tool=on_tool, **turned)  # pyright: ignore
-        columns, form = write_measurements(table, self.data, form, joints=self.robot)
+        form = write_measurements(table, self.data, form, joints=self.robot)
         _as_printed(table, self.robot.joint_names, DIGITS[self.design.joints.partition(", ")[2]])
         words = ["fit", str(table), "--robot", str(robot), "--base", self.robot.base, "--tip", "flange"]
-        return [*words, "--length", "mm", "--angle", "deg", "--joint-length", "m", *table_options(columns, form)]
+        return [*words, "--length", "mm", "--angle", "deg", "--joint-length", "m", *table_options(form)]
 
 
 def _as_printed(table: Path, joints: tuple[str, ...], digits: int) -> None:

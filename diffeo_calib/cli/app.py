@@ -7,29 +7,23 @@ from __future__ import annotations
 
 import inspect
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
 from diffeo_calib.cli import campaign
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
-from diffeo_calib.common.errors import printable, warn_user
-
-MASS = {"--payload": "--payload-mass"}
-RENAMED = {"correct": MASS, "export": MASS, "plan": MASS | {"--target": "--target-poses"}}
-"""Command -> former names of options, which had another meaning in other commands, and their names."""
+from diffeo_calib.common.errors import InputError, printable
 
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
 """Of the command that runs."""
-_renamed: list[str] = []
-"""Warnings about former names among them."""
 
 
 def command_line() -> str:
@@ -57,9 +51,7 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        if (several := campaign.asked(args, DECLARED)) is not None:
-            raise typer.Exit(campaign.run(several))
-        _arguments[:], _renamed[:] = _with_names(campaign.expanded(args, DECLARED))
+        _arguments[:] = campaign.expanded(args, DECLARED)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -68,24 +60,10 @@ class FlagsOff(TyperGroup):
         """Run a command; a bad value is named without typer's own words, and without control characters."""
         try:
             with record.written(list(_arguments)):
-                for text in _renamed:
-                    warn_user(text)
                 return super().invoke(ctx)
         except typer.BadParameter as error:
             error.message = printable(error.message.removeprefix("Value error, "))
             raise
-
-
-def _with_names(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words with the names of options in the place of former ones, and what to say about these."""
-    command = next((word for word in words if not word.startswith("-")), "")
-    found, said, names = list[str](), list[str](), RENAMED.get(command, {})
-    for word in words:
-        name, equal, value = word.partition("=")
-        if name in names:
-            said.append(f"{name} of `{command}` is called {names[name]} now; {name} will be removed")
-        found.append(names.get(name, name) + equal + value)
-    return found, said
 
 
 app = typer.Typer(
@@ -118,13 +96,20 @@ Json = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
+    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them.
+
+    Attributes:
+        needs: option -> those of which it needs one. beside: option -> those that it cannot stand beside.
+    """
+
+    needs: ClassVar[dict[str, str]] = {}
+    beside: ClassVar[dict[str, str]] = {}
 
     def check(self) -> None:
-        """Refuse options that do not belong together."""
+        """Refuse options that cannot be meant."""
 
     @property
-    def beside(self) -> dict[str, Path]:
+    def more_files(self) -> dict[str, Path]:
         """Files that are written beside those that options name."""
         return {}
 
@@ -143,13 +128,19 @@ def command(name: str) -> Callable[[type[Options]], type[Options]]:
 
         def run(_json: Any, **given: Any) -> None:
             made = _made(options, given)
-            files: dict[str, dict[str, Path]] = {"write": dict(made.beside), "read": {}, "appended": {}, "folder": {}}
+            files: dict[str, dict[str, Path]] = {
+                "write": dict(made.more_files),
+                "read": {},
+                "appended": {},
+                "folder": {},
+            }
             for key, (_, field) in leaves.items():
                 for path in given[key] if isinstance(given[key], list) else [given[key]]:
                     if isinstance(path, Path):
                         shown = names_of(field)[0] + f" {path}" * isinstance(given[key], list)
                         files[field.metadata["file"]][shown] = path
             check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
+            check_together(typed_options(leaves, given), options.needs, options.beside)
             made.check()
             import_module(f"diffeo_calib.cli.commands.{name}").run(made)
 
@@ -177,6 +168,23 @@ def names_of(field: Field[Any]) -> tuple[str, ...]:
     if field.metadata["made"] is typer.Argument:
         return (field.metadata["how"]["metavar"],)
     return field.metadata["names"] or (f"--{field.name.replace('_', '-')}",)
+
+
+def typed_options(leaves: Mapping[str, tuple[Any, Field[Any]]], given: Mapping[str, Any]) -> set[str]:
+    """The options and arguments whose values are not those by default."""
+    return {names_of(field)[0] for key, (_, field) in leaves.items() if given[key] not in (None, [], field.default)}
+
+
+def check_together(typed: Container[str], needs: Mapping[str, str], beside: Mapping[str, str]) -> None:
+    """Refuse an option without those, separated by spaces, of which it needs one, or beside those that exclude it."""
+    for option, others in needs.items():
+        if option in typed and not any(other in typed for other in others.split()):
+            what = f"{option} without {' or '.join(others.split())}"
+            raise InputError.of(what, fix="name this too, or leave the option out")
+    for option, others in beside.items():
+        for other in others.split():
+            if option in typed and other in typed:
+                raise InputError.of(f"{option} beside {other}", fix="leave one of them out")
 
 
 def _parameter(hint: Any, field: Field[Any]) -> inspect.Parameter:

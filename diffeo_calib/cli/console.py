@@ -19,7 +19,7 @@ from typing import Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
@@ -45,10 +45,6 @@ WORDS = {
     "images": "looking for the board",
 }
 """Task of the library -> what it does."""
-LIMITED = ("hyper-parameters", "Gauss-Newton")
-"""Tasks that may end before their total."""
-FEWEST_SECONDS = 1.0
-"""Before that no remaining time is told."""
 
 out = Console(width=None if sys.stdout.isatty() else WIDTH)
 err = Console(stderr=True)
@@ -86,7 +82,8 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
 
     Python users pass it on too: ``with progress_bar() as progress: dc.calibrate(..., progress=progress)``.
     """
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), _Steps(bar_width=30), TimeElapsedColumn(), _Left())
+    times = TimeElapsedColumn(), TimeRemainingColumn()
+    columns = SpinnerColumn(), TextColumn("{task.description}"), _Steps(bar_width=30), *times
     seen = err.is_terminal or err.is_jupyter
     with Bar(*columns, console=err, transient=True, get_time=clock, disable=not seen) as bar:
         line, current, last = bar.add_task("starting", total=None), "", 0
@@ -95,7 +92,7 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
             """Show this task, from its beginning if it is another one or starts again."""
             nonlocal current, last
             if task != current or done < last:
-                bar.reset(line, description=WORDS.get(task, task), total=None, at_most=task in LIMITED)
+                bar.reset(line, description=WORDS.get(task, task), total=None)
             bar.update(line, completed=done, total=total if total > 1 else None)
             current, last = task, done
 
@@ -107,22 +104,6 @@ class _Steps(BarColumn):
 
     def render(self, task: Task) -> Any:
         return Text("") if task.total is None else super().render(task)
-
-
-class _Left(ProgressColumn):
-    """How long a task will take by the time that its steps have taken."""
-
-    def render(self, task: Task) -> Text:
-        left = remaining(task.completed, task.total, task.elapsed)
-        return Text("" if left is None else f"{'at most' if task.fields.get('at_most') else 'about'} {left} left")
-
-
-def remaining(done: float, total: float | None, seconds: float | None) -> str | None:
-    """Time for the rest of a task whose steps take the same time, in words; None if it cannot be told yet."""
-    if total is None or seconds is None or done <= 0 or seconds < FEWEST_SECONDS:
-        return None
-    left = round(seconds * max(total - done, 0.0) / done)
-    return f"{left} s" if left < 100 else f"{-(-left // 60)} min"
 
 
 @contextmanager

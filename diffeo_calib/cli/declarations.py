@@ -25,7 +25,6 @@ from diffeo_calib.cli.options import (
     Places,
     Robot,
     Rows,
-    StoredUnits,
     Targets,
     Units,
     argument,
@@ -77,9 +76,6 @@ class FitOptions(Command):
         "MODEL",
     )
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
-    jobs: int | None = option(
-        "With several campaign files: how many run at a time; the exit code counts those that failed.", "N"
-    )
 
 
 @command("campaign")
@@ -105,22 +101,11 @@ class CampaignOptions(Command):
     json_lines: bool = option(
         "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
     )
-    bag: Path | None = option("Append the stops of a ROS 2 bag to CSV, at their times; see `record`.", "BAG")
-    seen: str | None = option("Topic of --bag: stamped points, poses or transforms that a device measured.", "TOPIC")
-    joint_states: str = option("Topic of --bag: joint states.", "TOPIC", default="/joint_states")
-    speed: float = option("How many times faster --bag is played than it was recorded.", min=1e-3, default=1.0)
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
     page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
     next: int = option("Number of poses that are proposed after each row.", min=0, default=1)
     accepted: Path | None = written("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
-
-    def check(self) -> None:
-        if (self.bag is None) != (self.seen is None):
-            raise InputError.of("--bag and --seen belong together", fix="name both, or none")
-        if self.bag is not None and (self.once or self.stdin):
-            what = "--once and --stdin beside --bag, whose end is that of the campaign"
-            raise InputError.of(what, fix="leave them out")
 
 
 @command("record")
@@ -156,7 +141,7 @@ class EvaluateOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     rows: Rows
     register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
     free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
@@ -165,13 +150,8 @@ class EvaluateOptions(Command):
         "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
     )
     residuals: Path | None = written("Write the error of every row to this file: measured minus predicted.", "TABLE")
-
-    def check(self) -> None:
-        if not self.register and not (self.free is None and self.output is None):
-            raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
-        if self.register and not (self.fail_above is None and self.residuals is None):
-            fix = "write the registered model with -o, and evaluate that"
-            raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)
+    needs = dict.fromkeys(("--free", "-o"), "--register")
+    beside = dict.fromkeys(("--fail-above", "--residuals"), "--register")
 
 
 @command("init")
@@ -230,7 +210,7 @@ class PredictOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     output: Path = output("Table of predictions to write.", "CSV")
     convention: str | None = option(CONVENTION)
     rotation_angle: Angle | None = option(ROTATION_ANGLE)
@@ -256,7 +236,7 @@ class CorrectOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     program: Path = argument("PROGRAM", "Table with a header, one command per row; other columns are kept.")
-    units: StoredUnits
+    units: Units
     output: Path = output("Corrected program to write.", "CSV")
     targets: Targets
     tip: list[str] | None = option(
@@ -331,6 +311,11 @@ class ExportOptions(Command):
     payload_mass: float | None = option(MASS, "MASS")
     length: Length = option("Unit of lengths in the CSV files written.", default="m")
     angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
+    needs = dict.fromkeys(("--tool", "--frame"), "--c --torch --onnx") | {
+        "--with-tables": "--urdf --mjcf --dh --ur-kinematics",
+        "--ur-hash": "--ur-kinematics",
+        "--tip": "--c --dh",
+    }
 
     @property
     def outputs(self) -> dict[str, Path | None]:
@@ -339,7 +324,7 @@ class ExportOptions(Command):
         return {f"--{field.name.replace('_', '-')}": getattr(self, field.name) for field in own}
 
     @property
-    def beside(self) -> dict[str, Path]:
+    def more_files(self) -> dict[str, Path]:
         """The header of C."""
         return {} if self.c is None else {"--c (its header)": self.c.with_suffix(".h")}
 
@@ -347,15 +332,8 @@ class ExportOptions(Command):
         wanted = {option for option, target in self.outputs.items() if target is not None}
         if not wanted:
             raise typer.BadParameter(f"name at least one file to write: {', '.join(self.outputs)}")
-        rigid = {"--urdf", "--dh", "--ur-kinematics"}
-        if self.with_tables and not ("--correction-tables" in wanted and wanted & rigid):
-            raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
-        if self.ur_hash is not None and "--ur-kinematics" not in wanted:
-            raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
-        if self.tip and not wanted & {"--c", "--dh"}:
-            raise typer.BadParameter("--tip belongs to --c and --dh: the other files hold all tips")
-        if (self.tool or self.frame) and not wanted & {"--c", "--torch", "--onnx"}:
-            raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")
+        if self.with_tables and self.correction_tables is None:
+            raise InputError.of("--with-tables without --correction-tables", fix="name both, or none")
 
 
 @command("plan")
@@ -367,7 +345,7 @@ class PlanOptions(Command):
     """
 
     count: int = option("Number of poses to plan.", names=("-n", "--count"), min=1, default=...)
-    units: StoredUnits
+    units: Units
     output: Path = output("Table of poses to write: the joints, and a rank.", "CSV")
     cell: Candidates
     model: Path | None = argument(
@@ -393,21 +371,13 @@ class PlanOptions(Command):
         "KIND[=NUMBERS]",
     )
     payload_mass: float | None = option(MASS, "MASS")
+    needs = dict.fromkeys(("--payload-mass", "--free"), "MODEL")
+    beside = dict.fromkeys(("--robot", "--base", "--tip", "--load", "--dh-convention", "--marker"), "MODEL")
+    beside |= dict.fromkeys(("--draw", "--range", "--tracker", "--floor", "--column", "--collisions"), "--candidates")
 
     def check(self) -> None:
-        known = {"robot": self.robot, **vars(self.links), "marker": self.marker}
-        named = [f"--{name.replace('_', '-')}" for name, value in known.items() if value is not None]
-        if self.model is not None and named:
-            fix = "leave them out: the model knows its robot and its markers"
-            raise InputError.of(f"{', '.join(named)} beside a MODEL", fix=fix)
         if self.model is None and self.robot is None:
             raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
-        if self.model is None and self.payload_mass is not None:
-            fix = "leave it out: no sag under a payload is known yet"
-            raise InputError.of("--payload-mass without a MODEL", fix=fix)
-        if self.model is None and self.free is not None:
-            raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
-        self.cell.check()
 
 
 @command("recalibrate")
@@ -422,7 +392,7 @@ class RecalibrateOptions(Command):
 
     old: Path = argument("OLD", "Model file of an earlier calibration.")
     csv: Path = argument("CSV", CSV)
-    units: StoredUnits
+    units: Units
     output: Path = output("Model file to write.", "MODEL")
     rows: Rows
     drift: Literal["tested", "none"] = option(
@@ -445,13 +415,9 @@ class CompareOptions(Command):
 
     old: Path = argument("OLD", "Model file of an earlier calibration.")
     other: Path = argument("OTHER", "Table of new measurements, or another model file of the same robot.")
-    units: StoredUnits
+    units: Units
     rows: Rows
-    level: float = option(
-        "Probability that anything is named although nothing changed.", min=0.001, max=0.2, default=0.01
-    )
     tests: ChangeTests
-    figure: Path | None = written("With a model: draw where the two differ.", "IMAGE")
 
 
 @command("report")
@@ -464,12 +430,11 @@ class ReportOptions(Command):
 
     model: Path = argument("MODEL", MODEL)
     output: Path = output("Page to write.", "HTML")
-    units: StoredUnits
+    units: Units
     rows: Rows
     data: Path | None = option(
         "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
     )
-    title: str = option("Title of the page; the robot by default.", "TEXT", default="")
     against: list[str] | None = option(
         "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
         "names.",
@@ -478,11 +443,7 @@ class ReportOptions(Command):
     tolerance: str | None = option(
         "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
     )
-
-    def check(self) -> None:
-        if self.data is None and (self.rows.named or self.units.length or self.units.angle or self.against):
-            what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
-            raise InputError.of(what, fix="name the table with --data, or leave them out")
+    needs = dict.fromkeys(("--position", "--socket", "--reading", "--length", "--angle", "--against"), "--data")
 
 
 @command("demo")

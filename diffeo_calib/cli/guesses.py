@@ -24,13 +24,25 @@ PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
-SESSIONS = ("session", "setup", "station", "anchor", "device", "plane")
-PAYLOADS = ("payload", "mass", "load")
-COVARIATES = {
-    "time": ("time", "times", "timeh", "timestamp", "seconds", "minutes", "hours", "hour"),
-    "temperature": ("temperature", "temp", "temperaturec", "tempc"),
+
+
+class Named(NamedTuple):
+    """A column besides the joints and what was measured: names by which it is known; what it holds."""
+
+    names: tuple[str, ...]
+    what: str
+
+
+DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
+NAMED = {
+    "session": Named(
+        ("session", "setup", "station", "anchor", "device", "plane"), "the device, or its set-up, of every row"
+    ),
+    "payload": Named(("payload", "mass", "load"), "the known mass that the robot carried"),
+    "time": Named(("time", "times", "timeh", "timestamp", "seconds", "minutes", "hours", "hour"), DRIFT),
+    "temperature": Named(("temperature", "temp", "temperaturec", "tempc"), DRIFT),
 }
-"""Option -> names of columns with which something may drift."""
+"""By the option that names the column."""
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
 ROTATIONS = (

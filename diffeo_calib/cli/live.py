@@ -19,6 +19,7 @@ from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""
@@ -92,7 +93,8 @@ class Live:
     def _check_header(self) -> None:
         """Raise InputError where columns are named by their places and the first line is a row."""
         named = {cell.strip() for cell in self.table.cells(self.table.header)}
-        joints = JointExpressions.of(joint_columns(self.source.joints, self.campaign.robot)).columns
+        own = joint_columns(self.source.joints, self.campaign.robot)
+        joints = own.columns if isinstance(own, PoseColumns) else JointExpressions.of(own).columns
         places = [name for name in joints if name.isdecimal() and name not in named]
         if self.table.header and places:
             what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
@@ -107,8 +109,7 @@ class Live:
         numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
         found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
         found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
-        found |= {name: getattr(source.columns, name) for name in ("session", "sockets", "readings")}
-        found["position"] = [",".join(triple) for triple in source.columns.position or ()]
+        found["position"] = [",".join(triple) for triple in source.table.position or ()]
         found["joints"] = joint_columns(source.joints, robot)
         texts = {name: str(value) for name, value in found.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
@@ -262,7 +263,7 @@ class Live:
             entry["error_limit_mm"] = None if limit is None else 1e3 * limit
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
-        columns = Columns.of(self.source.table.joints_only(), names, robot.kinds, [])
+        columns = Columns.of(self.source.table.joints_only(names, robot.kinds))
         poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
         return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import Links, Robot, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Links, Robot, Rows, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
@@ -103,13 +103,13 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
 
 
-def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
+def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
     """Options of a command with a model, completed by those of the command that made it."""
     made = model.provenance
     return as_at_the_fit("" if made is None else made.command or made.table, rows, units)
 
 
-def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: StoredUnits) -> MeasuredTable:
+def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: Units) -> MeasuredTable:
     """A table of measurements, read as that of the model's fit unless the options say otherwise.
 
     Kinds of rows of the fit that the table has no column of are left out.

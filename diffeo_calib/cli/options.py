@@ -11,14 +11,11 @@ from typing import Any, Literal
 
 import typer
 
-from diffeo_calib.common.errors import InputError
-
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
-DRAWN, FACING_HALF_ANGLE_DEG = 3000, 45.0
+DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
-AS_STORED = "by default as at the fit"
 
 
 def option(
@@ -76,40 +73,29 @@ PAYLOAD = "Column with the known mass that the robot carried, in any unit."
 
 # --- how a table is written ---------------------------------------------------------------------------------------
 
-SEP, DECIMAL = "Column separator of the table ('\\t' for a tab)", "Decimal mark of the table"
-JOINTS = (
-    "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of the "
-    "table, such as -{J2}+90 or {J3}+{J2}."
-)
-ROBOT_POSE = (
-    "Columns of the place or pose to which the machine was told to go, as its controller writes it, in place of joint "
-    "values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention (angles in the unit of "
-    "--angle)."
-)
-LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit of revolute joints in the table"
-
 
 @dataclass(frozen=True, kw_only=True)
-class StoredUnits:
-    """How tables are written, for commands with a model, which may know it."""
+class Units:
+    """How tables are written; a model knows that of the table of its fit."""
 
-    length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
-    angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
+    length: Length | None = option(
+        "Unit of positions in the table, and of prismatic joints; needed where no model knows it."
+    )
+    angle: Angle | None = option("Unit of revolute joints in the table; needed where no model knows it.")
     joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
-    joints: str | None = option(JOINTS, "A,B,...")
-    robot_pose: str | None = option(ROBOT_POSE, "X,Y,Z[,...]")
-    sep: str | None = option(f"{SEP}, {AS_STORED}.")
-    decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Units(StoredUnits):
-    """The same where units must be stated."""
-
-    length: Length = option(f"{LENGTH}.", default=...)
-    angle: Angle = option(f"{ANGLE}.", default=...)
-    sep: str = option(f"{SEP}.", default=",")
-    decimal: str = option(f"{DECIMAL}.", default=".")
+    joints: str | None = option(
+        "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of "
+        "the table, such as -{J2}+90 or {J3}+{J2}.",
+        "A,B,...",
+    )
+    robot_pose: str | None = option(
+        "Columns of the place or pose to which the machine was told to go, as its controller writes it, in place of "
+        "joint values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the "
+        "unit of --angle.",
+        "X,Y,Z[,...]",
+    )
+    sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")
+    decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,15 +233,10 @@ class Candidates:
         names=("--range",),
     )
     tracker: str | None = option(
-        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker.", "X,Y,Z"
-    )
-    facing: str | None = option(
-        "With --tracker: direction in which the marker looks, in the frame of the tip; 0,0,1 by default.", "X,Y,Z"
-    )
-    cone: float | None = option(
-        "With --tracker: largest angle in degrees between that direction and the line to the device, "
-        f"{FACING_HALF_ANGLE_DEG:g} by default.",
-        "DEG",
+        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker. Behind "
+        "it the direction in which the marker looks, in the frame of the tip (0,0,1), and the largest angle in degrees "
+        "between that and the line to the device (45).",
+        "X,Y,Z[,DX,DY,DZ[,DEG]]",
     )
     floor: float | None = option("Height in the base frame below which no link and no marker may be.", "Z")
     column: str | None = option(
@@ -266,15 +247,6 @@ class Candidates:
         default=False,
     )
     seed: int = option("Seed of the random candidates.", min=0, max=LARGEST_SEED, default=0)
-
-    def check(self) -> None:
-        """Refuse options of random configurations beside a table of candidates."""
-        drawing = {"draw": self.draw, "range": self.limits, "tracker": self.tracker, "floor": self.floor}
-        drawing |= {"column": self.column, "collisions": self.collisions or None}
-        given = [f"--{name}" for name, value in drawing.items() if value is not None]
-        if self.candidates is not None and given:
-            what = f"{', '.join(given)} beside --candidates: these options are about random configurations"
-            raise InputError.of(what, fix="leave them out, or leave --candidates out")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.rotations import EULER
-from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.poses import numbers_of
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -73,13 +73,12 @@ def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
         yield from deviations(source)
 
 
-def marker(source: Source, sheet: Sheet) -> Choice | None:
+def marker(source: Source) -> Choice | None:
     """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
     alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
-    for length, angle in product(*UNITS) if alone else ():
+    for _, _, data in source.in_units() if alone else ():
         with warnings.catch_warnings(), suppress(DiffeoCalibError):
             warnings.simplefilter("ignore")
-            data = source.read(TableFormat(length, angle, sheet.sep, sheet.decimal))
             found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
             if found is not None:
                 return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
@@ -101,15 +100,16 @@ class Source:
 
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
-        options = Rows(session=self.rows.session, camera_on_tool=table.camera_on_tool)
+        session = self.rows.named.get("session")
+        options = Rows(session=session, camera_on_tool=table.camera_on_tool)
         readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
         sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
         markers = self.rows.markers or None
-        session = self.rows.session if markers else None
         marker = None if self.marker is None else str(self.marker.value)
-        columns = TableColumns(self.joints, markers, sockets, readings, session, self.robot.kinds, marker=marker)
+        table = replace(table, joints=self.joints, kinds=self.robot.kinds, position=markers, sockets=sockets)
+        table = replace(table, readings=readings, session=session if markers else None, marker=marker)
         table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
-        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
+        data: Any = read_observations(self.csv, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
 
@@ -158,9 +158,8 @@ class Source:
             list[tuple[float, str, str, Measurements]](),
             torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST),
         )
-        for length, angle in product(*UNITS):
-            own = self.positions(length, angle)
-            if own is None or length in (entry[1] for entry in likely):
+        for length, angle, own in self.in_units():
+            if length in (entry[1] for entry in likely):
                 continue
             small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
             moved = spread(self.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
@@ -183,13 +182,15 @@ class Source:
                 yield Choice("angle", angle, "the same")
                 return
 
-    def positions(self, length: str, angle: str) -> Measurements | None:
-        """Measured positions of the largest set-up, read in these units; None if the file says others."""
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
-            found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
-            return None if found is None else found.largest_session()
-        return None
+    def in_units(self) -> Iterator[tuple[str, str, Measurements]]:
+        """Units of length and angle, and the positions of the largest set-up in these, unless the file says others."""
+        for length, angle in product(*UNITS):
+            found = None
+            with warnings.catch_warnings(), suppress(DiffeoCalibError):
+                warnings.simplefilter("ignore")
+                found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
+            if found is not None:
+                yield length, angle, found.largest_session()
 
     def words(self, best: float, others: float) -> str:
         """Residuals with the best units, and the smallest with other units."""
@@ -263,9 +264,8 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
 def measured(source: Source) -> Source:
     """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
     found, several = dict[int, str](), len(source.rows.markers) > 1
-    for length, angle in product(*UNITS) if several else ():
-        positions = source.positions(length, angle)
-        every = [] if positions is None else unmeasured_markers(source.robot, positions)
+    for _, _, positions in source.in_units() if several else ():
+        every = unmeasured_markers(source.robot, positions)
         found = found or {marker: words for marker, words, proved in every if proved}
     rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os.path import relpath
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +13,8 @@ from typing import NamedTuple
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
-    COVARIATES,
     LENS,
-    PAYLOADS,
-    SESSIONS,
+    NAMED,
     Sheet,
     guess_column,
     guess_matrix,
@@ -59,17 +57,15 @@ class RowColumns:
     """Columns of what was measured, by their names.
 
     Args:
-        markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. session: of the device
-            or its set-up. payload: of the mass carried. covariates: option, time or temperature -> column.
+        markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. named: option -> column
+            of the device or its set-up, the payload, time, temperature.
         matrix: the nine of the rotation, by rows, where poses are written as matrices. left: what is not used, and why.
     """
 
     markers: list[list[str]]
     sockets: list[str]
     readings: list[str]
-    session: str | None
-    payload: str | None
-    covariates: dict[str, str] = field(default_factory=dict)
+    named: dict[str, str]
     matrix: Sequence[str] = ()
     left: Sequence[str] = ()
 
@@ -101,14 +97,11 @@ class RowColumns:
             why += "; the lens is that of the file beside the table" * (self.of_boards and not sizes)
             why += "; width and height of the images are the least usual size that holds all corners" * sizes
             yield Choice("reading", self.readings[0] if len(self.readings) == 1 else self.readings, why)
-        if self.session is not None:
-            why = "by its name: the device, or its set-up, of every row"
-            why += "; add `remounted = true` if it stayed and the markers were mounted anew" * bool(self.markers)
-            yield Choice("session", self.session, why)
-        if self.payload is not None:
-            yield Choice("payload", self.payload, "by its name: the known mass that the robot carried")
-        for option, name in self.covariates.items():
-            yield Choice(option, name, "by its name: a drift with it is sought, and kept where left-out rows prove it")
+        for option, name in self.named.items():
+            why = f"by its name: {NAMED[option].what}"
+            remounted = option == "session" and bool(self.markers)
+            why += "; add `remounted = true` if it stayed and the markers were mounted anew" * remounted
+            yield Choice(option, name, why)
 
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
@@ -131,11 +124,11 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
         got = "; ".join(left) or few(sheet.numbers, 20)
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
     named = [name for name in sheet.header if name not in joints]
-    session = None if sockets and not readings else guess_column(named, SESSIONS)
-    guessed = {option: guess_column(others, words) for option, words in COVARIATES.items()}
-    drifting = {option: name for option, name in guessed.items() if name is not None}
+    columns = {"session": [] if sockets and not readings else named}
+    guessed = {option: guess_column(columns.get(option, others), one.names) for option, one in NAMED.items()}
     nine = [name for own in matrix[1:] for name in own]
-    return RowColumns(markers, sockets, readings, session, guess_column(others, PAYLOADS), drifting, nine, left)
+    found = {option: name for option, name in guessed.items() if name is not None}
+    return RowColumns(markers, sockets, readings, found, nine, left)
 
 
 def matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:

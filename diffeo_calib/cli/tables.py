@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -19,10 +19,10 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, leaves_of, names_of
+from diffeo_calib.cli.app import add_to_command_line, check_together, leaves_of, names_of, typed_options
 from diffeo_calib.cli.campaign import has
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Rows, StoredUnits, Targets, Units
+from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
@@ -30,7 +30,7 @@ from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
@@ -42,33 +42,41 @@ from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 POSE_JOINTS = 6
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
+NEEDS = {"--lever": "--rotation", "--camera-on-tool": "--rotation --reading", "--places": "--by", "--by": "--places"}
+NEEDS |= {"--distance-std": "--socket", "--distance": "--distance-std"}
+"""Options of rows, and those of which they need one."""
 
 
 def table_format(units: Units) -> TableFormat:
-    """The format of a table of points; the separator may be a tab written as \\t or tab."""
-    mark = "\t" if units.sep in ("\\t", "tab") else units.sep
-    return TableFormat(units.length, units.angle, mark, units.decimal, joint_length=units.joint_length)
+    """The format of a table of points; the separator may be a tab written as \\t or tab.
+
+    InputError for a unit that is neither typed nor kept with the model.
+    """
+    length, angle, sep = units.length, units.angle, "," if units.sep is None else units.sep
+    if length is None or angle is None:
+        missing = " and ".join(f"--{name}" for name in ("length", "angle") if getattr(units, name) is None)
+        fix = "state the units of the table; a model that `fit` made knows those of its own"
+        raise InputError.of(f"{missing} missing", fix=fix)
+    mark = "\t" if sep in ("\\t", "tab") else sep
+    return TableFormat(
+        length, angle, mark, "." if units.decimal is None else units.decimal, joint_length=units.joint_length
+    )
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with columns of rotations, deviations, payloads and covariates; lever in the unit of length."""
-    if rows.lever is not None and rows.rotation is None:
-        raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
-    if rows.camera_on_tool and rows.rotation is None and not rows.images:
-        raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
+    """The same format with the columns that options name, but for readings; lever in the unit of length."""
+    check_together(typed_options(dict(leaves_of(Rows)), vars(rows)), NEEDS, {})
+    as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
+        **{name: getattr(rows, name) for name in as_typed},
+        position=_position_triples(rows.position or []) or None,
         rotation=_names_of_each(rows.rotation),
-        convention=rows.convention,
-        rotation_angle=rows.rotation_angle,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
-        remounted=rows.remounted,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
-        payload=rows.payload,
-        time=rows.time,
-        temperature=rows.temperature,
+        sockets=socket_columns(rows.socket, rows.distance, rows.distance_std, table),
     )
 
 
@@ -80,40 +88,27 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
     readings = readings_columns(rows.reading or (), rows, _number_columns(csv, rows, table))
-    sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
-    triples = _position_triples(rows.position or []) or None
-    columns = TableColumns((), triples, sockets, readings, rows.session, marker=rows.marker)
-    return MeasuredTable(csv, joints_of(units), columns, table, duplicates)
+    return MeasuredTable(csv, joints_of(units), replace(table, readings=readings), duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
     """The table, joined with that of the measured places if there is one."""
-    if (rows.places is None) != (rows.by is None):
-        fix = "--places names the file of the measured places, --by a column of both files"
-        raise InputError.of("--places and --by belong together", fix=fix)
     if rows.places is None or rows.by is None:
         return csv
     return joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
 
 
 def check_place(rows: Rows) -> None:
-    """Raise an error unless positions, sockets or readings are named, or for distances without sockets."""
+    """Raise an error unless positions, sockets or readings are named."""
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    if rows.socket is None and (rows.distance or rows.distance_std is not None):
-        raise InputError.of("--distance without --socket", fix="name the columns of the sockets too")
-    if rows.distance and rows.distance_std is None:
-        fix = (
-            "say how well the distances are known, in the unit of --length: 0.03 mm for a block measured with a caliper"
-        )
-        raise InputError.of("--distance without --distance-std", fix=fix)
 
 
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
@@ -142,7 +137,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return completed[0], stated_units(completed[1])
+    return completed
 
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
@@ -165,22 +160,12 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     return replace(rows, reading=kept or None, **changes), missing
 
 
-def stated_units(units: StoredUnits) -> Units:
-    """Units that are known; InputError for one that is neither typed nor kept with the model."""
-    missing = [f"--{name}" for name in ("length", "angle") if getattr(units, name) is None]
-    if missing:
-        fix = "state the units of the table; a model that `fit` made knows those of its own"
-        raise InputError.of(f"{' and '.join(missing)} missing", fix=fix)
-    given = {name: value for name, value in asdict(units).items() if value is not None}
-    return Units(**given)
-
-
-def _options_of(group: type[StoredUnits] | type[Rows]) -> dict[str, tuple[str, Any]]:
+def _options_of(group: type[Units] | type[Rows]) -> dict[str, tuple[str, Any]]:
     """Option -> name and type of its field."""
     return {names_of(field)[0]: (name, hint) for name, (hint, field) in leaves_of(group)}
 
 
-def _read_options(words: Sequence[str], group: type[StoredUnits] | type[Rows]) -> dict[str, list[str]]:
+def _read_options(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, list[str]]:
     """Option of a group -> its words in a command line."""
     found: dict[str, list[str]] = {}
     options = _options_of(group)
@@ -219,13 +204,12 @@ class MeasuredTable:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints; or
             the columns of a pose.
-        columns: those of what was measured, whose joints are those of the robot that reads them.
-        table: the format. duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
+        table: what it holds, but for the joints, which are those of the robot that reads them.
+        duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
     """
 
     csv: Path
     joints: str | PoseColumns | None
-    columns: TableColumns
     table: TableFormat
     duplicates: str = "keep"
     growing: bool = False
@@ -239,23 +223,24 @@ class MeasuredTable:
         Returns:
             what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
         """
-        given, triples = self.columns, self.columns.position
+        given, triples = self.table, self.table.position
         several = len(tips) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         session = given.session if triples or not given.readings else None  # of readings it names their devices
-        columns = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
-        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates, growing=self.growing)
-        if given.marker is not None and given.marker != data.origin.marker:  # later tables have the same order
+        table = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
+        data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
+        named: Any = given.marker and data.origin.columns.table.marker
+        if given.marker != named:  # later tables have the same order
             say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
-            add_to_command_line(["--marker", data.origin.marker])
+            add_to_command_line(["--marker", named])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
-        if count and self.columns.session is None:
+        if count and self.table.session is None:
             what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
             fix = "name the column of the set-ups (--session), or leave these rows out"
             warn_user(sentence(f"{what}its frame", fix=fix))
@@ -292,11 +277,10 @@ class ProgramTable:
             fix = "name the columns of the targets once for every --tip"
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
-        table = with_rows(self.table, turned) if rotation else self.table
-        names, triples = joint_columns(self.joints, robot), _position_triples(position)
-        columns = TableColumns(names, triples, kinds=robot.kinds)
-        data = read_observations(self.csv, columns, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
-        lines = [line for line, _ in read_cells(self.csv, table.sep, columns.numeric(table).names)[1]]
+        table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
+        table = replace(table, joints=joint_columns(self.joints, robot), position=_position_triples(position))
+        data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
+        lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
             what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.lines.tolist()}))}"
             raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
@@ -325,7 +309,7 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     return frame
 
 
-def joints_of(units: StoredUnits) -> str | PoseColumns | None:
+def joints_of(units: Units) -> str | PoseColumns | None:
     """The columns of the joints, or of the pose in their place, as the options name them."""
     if units.robot_pose is None:
         return units.joints

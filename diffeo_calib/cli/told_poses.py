@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import inf
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -141,7 +140,7 @@ def _entries(
     why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
     why += f", read in any other way {100 * worse:.3g} %" if worse < inf else ""
     first = "; by their names, poses that the machine was told, in place of joint values"
-    texts = list(dict.fromkeys(_text(one.joints) for one in (source, *others)))
+    texts = list(dict.fromkeys(one.joints.text for one in (source, *others)))
     columns = [Choice("robot-pose", text, why + first, sure=len(texts) == 1) for text in texts]
     table, units = source.table, list[Choice]()
     units.append(Choice("length", table.length, "the size of the numbers"))
@@ -158,11 +157,6 @@ def _entries(
     if table.camera_on_tool:
         units.append(Choice("camera-on-tool", True, "what stands is seen from the flange"))
     return columns, units
-
-
-def _text(joints: Any) -> str:
-    """The value of --robot-pose."""
-    return ",".join(joints.columns) + f"={joints.convention}" * bool(joints.convention)
 
 
 def _read(

@@ -58,90 +58,52 @@ def fitted_configurations(model: object) -> Tensor:
     return found
 
 
-class OutsideRange:
-    """Configurations outside the joint ranges of the fit, where the model's errors are not known, over many tables.
+def refuse_other_angles(model: Any, q: object) -> None:
+    """Raise MeasurementError for joint values that are those of the fit in the other unit of angles alone.
+
+    All of them are then within the joint ranges of the fit, and as they are none is. A warning if some are, but they
+    hardly move. Degrees are larger than what an axis can turn in radians: smaller values would be in any range around
+    zero.
 
     Args:
-        model: the calibrated model.
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
     """
-
-    def __init__(self, model: Any) -> None:
-        self.model = model
-        self.rows = self.outside = 0
-        self.joints = torch.zeros(model.robot.n, dtype=torch.bool, device=model.configurations.device)
-        self._turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=model.configurations.device)
-        self._outside_otherwise = [0 for _ in ANGLE_MISTAKES]
-        self._ends = model.configurations.new_empty(0, model.robot.n)
-
-    def add(self, q: object) -> None:
-        """Count configurations (N, n), rad or m."""
-        outside = joints_outside_range(self.model, q)
-        self.rows += len(outside)
-        self.outside += int(outside.any(1).sum())
-        self.joints |= outside.any(0)
-        values = self.model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
-        for number, (factor, _) in enumerate(ANGLE_MISTAKES):
-            meant = torch.where(self._turning, factor * values, values)
-            self._outside_otherwise[number] += int(joints_outside_range(self.model, meant).any(1).sum())
-        ends = torch.cat([self._ends, values])
-        self._ends = torch.stack([ends.amin(0), ends.amax(0)]) if len(ends) else ends
-
-    def refuse_other_unit(self) -> None:
-        """Raise MeasurementError for joint values that are those of the fit in the other unit of angles alone.
-
-        All of them are then within the joint ranges of the fit, and as they are none is. A warning if some are, but
-        they hardly move. Degrees
-        are larger than what an axis can turn in radians: smaller values would be in any range around zero.
-        """
-        for outside, (factor, words) in zip(self._outside_otherwise, ANGLE_MISTAKES, strict=True):
-            tells = self.rows > 0 and bool(self._turning.any())
-            tells = tells and outside == 0 and (factor > 1.0 or self._turns_too_far())
-            if tells and (self.outside == self.rows or self._moves_as_in_fit(factor)):
-                expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
-                text = sentence("the joint values", expected=expected, got=got, fix=angle_mistake(words))
-                if self.outside == self.rows:
-                    raise MeasurementError(text)
-                warn_user(text)
-
-    def _turns_too_far(self) -> bool:
-        """Whether some axis turns further than axes do."""
-        return float(self._ends[:, self._turning].abs().max()) > LARGEST_JOINT_ANGLE_RAD
-
-    def _moves_as_in_fit(self, factor: float) -> bool:
-        """Whether the turning joints move as in the fit if their values are multiplied by a factor, but hardly else."""
-        fitted = self.model.configurations
-        moved = (self._ends[1] - self._ends[0]) / (fitted.amax(0) - fitted.amin(0)).clamp(min=SAME_CONFIGURATION)
-        return (
-            factor > 1.0
-            and self.rows >= TELLING_ROWS
-            and float(factor * moved[self._turning].median()) > TELLING_MOTION
-        )
-
-    def warn(self) -> None:
-        """Warn (DiffeoCalibWarning) with the number of rows and the names of the joints, if there are any."""
-        if self.outside:
-            names = [name for name, out in zip(self.model.robot.joint_names, self.joints, strict=True) if bool(out)]
-            rows = f"{self.outside} of {self.rows} rows"
-            what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
-            fix = "trust them less than their standard deviations say, or measure there too"
-            warn_user(sentence(what, fix=fix))
+    values: Tensor = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
+    fitted, turning = model.configurations, torch.tensor(model.robot.periodic, dtype=torch.bool, device=values.device)
+    if not (len(values) and bool(turning.any())):
+        return
+    too_far = float(values[:, turning].abs().max()) > LARGEST_JOINT_ANGLE_RAD
+    moved = (values.amax(0) - values.amin(0)) / (fitted.amax(0) - fitted.amin(0)).clamp(min=SAME_CONFIGURATION)
+    all_outside = bool(joints_outside_range(model, values).any(1).all())
+    for factor, words in ANGLE_MISTAKES:
+        meant = torch.where(turning, factor * values, values)
+        if (factor < 1.0 and not too_far) or bool(joints_outside_range(model, meant).any()):
+            continue
+        moves = len(values) >= TELLING_ROWS and float(factor * moved[turning].median()) > TELLING_MOTION
+        if all_outside or (factor > 1.0 and moves):
+            expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
+            text = sentence("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+            if all_outside:
+                raise MeasurementError(text)
+            warn_user(text)
 
 
-def warn_outside_range(model: Any, q: object, *, refuse_other_unit: bool = False) -> None:
+def warn_outside_range(model: Any, q: object) -> None:
     """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
 
     Args:
         model: the calibrated model. q: (N, n) joint configurations, rad or m.
-        refuse_other_unit: see :meth:`OutsideRange.refuse_other_unit`.
 
     Warns:
         DiffeoCalibWarning: with the number of rows and the names of the joints.
     """
-    found = OutsideRange(model)
-    found.add(q)
-    if refuse_other_unit:
-        found.refuse_other_unit()
-    found.warn()
+    outside = joints_outside_range(model, q)
+    if bool(outside.any()):
+        names = [name for name, out in zip(model.robot.joint_names, outside.any(0).tolist(), strict=True) if out]
+        rows = f"{int(outside.any(1).sum())} of {len(outside)} rows"
+        what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
+        fix = "trust them less than their standard deviations say, or measure there too"
+        warn_user(sentence(what, fix=fix))
 
 
 def check_same_robot(model: Any, data: Any) -> None:
@@ -151,13 +113,11 @@ def check_same_robot(model: Any, data: Any) -> None:
         model: a calibrated model. data: rows of any kinds.
 
     Raises:
-        InputError: joints in another order. MeasurementError: see :meth:`OutsideRange.refuse_other_unit` and
+        InputError: joints in another order. MeasurementError: see :func:`refuse_other_angles` and
             :meth:`Sensor.check_angles`.
     """
     check_joint_order(model.robot, data)
     check_payload_link(model.nominal.load.link, data)
-    found = OutsideRange(model)
-    found.add(data.q)
-    found.refuse_other_unit()
+    refuse_other_angles(model, data.q)
     for table, _ in rows_of_one_kind(data):
         sensor_of(table).check_angles(table, model)

@@ -6,7 +6,8 @@ Units exist only in files. They must always be named and are never guessed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import of_measurements
@@ -20,13 +21,39 @@ UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 
 @dataclass(frozen=True)
 class TableFormat:
-    """How a table of measurements or predictions is written.
+    """What a table of measurements or predictions holds, and how it is written.
 
     Args:
+        length: unit of the positions in the file. angle: of its revolute joints.
+        sep: one character between cells. decimal: ``"."`` or ``","``.
+        rotation: names of the columns of the tool's rotation, for measured poses, or one such list for each frame on
+            several tips, whose origins are the positions. Rotation and position map from the tool's frame to the
+            measuring frame.
+        convention: how all rotations are written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
+            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
+        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
+        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
+        std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
+            per marker or three per marker.
+        rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
+            which are not the axes of Euler angles: one for all, or one or three for each frame.
+        joint_length: unit of the prismatic joints in the file; that of the positions by default.
+        payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
+            For another link see :meth:`Measurements.with_payload`.
+        time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
+        camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
+            deviations are along its axes; see :meth:`Measurements.from_poses`.
         remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
-
-    The others are as in :func:`read_measurements`: units, marks, and names of columns, those of rotations None for a
-    table of points.
+        joints: names of the joint columns in the robot's order, or the robot, or expressions of columns. kinds: of each
+            joint; by default those of the robot, or all revolute.
+        position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
+        sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/images.py).
+        session: name of a column whose texts tell the set-ups of the device apart that measures positions or poses, see
+            :meth:`Measurements.with_sessions`.
+        on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
+        marker: name of a column that names the marker of every line, where each has the position of one. Lines with the
+            same joint values that follow each other are one row. Markers are in the order in which they appear, or, for
+            rows of a model, in the one that ``"COLUMN=A,B,C"`` gives.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -48,6 +75,14 @@ class TableFormat:
     temperature: str | None = None
     camera_on_tool: bool = False
     remounted: bool = False
+    joints: Any = ()
+    kinds: Sequence[str] | None = None
+    position: Names | None = None
+    sockets: Any = None
+    readings: tuple[Any, ...] = ()
+    session: str | None = None
+    on: Sequence[str] | None = None
+    marker: str | None = None
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
@@ -85,10 +120,17 @@ class TableFormat:
         """Units of the prismatic joints per metre."""
         return UNITS_PER_METRE[self.joint_unit]
 
-    def joints_only(self) -> TableFormat:
-        """The same units, separator and decimal mark, and payload, for a table of joint values."""
-        plain = TableFormat(self.length, self.angle, self.sep, self.decimal, joint_length=self.joint_length)
-        return replace(plain, payload=self.payload, time=self.time, temperature=self.temperature)
+    def joints_only(self, joints: Any, kinds: Sequence[str] | None = None) -> TableFormat:
+        """The same units, marks, payload and covariates, for a table of the values of these joints."""
+        kept = "length", "angle", "sep", "decimal", "joint_length", "payload", "time", "temperature"
+        return TableFormat(**{name: getattr(self, name) for name in kept}, joints=joints, kinds=kinds)
+
+    @property
+    def triples(self) -> list[tuple[str, ...]]:
+        """Names of x, y and z of every marker; MeasurementError for other numbers of names."""
+        if self.position is None:
+            return []
+        return list(by_frame("position", self.position, "three names of columns for each marker", 3))
 
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.
@@ -132,9 +174,9 @@ class TableFormat:
         check_choice("rotation_angle", unit, ANGLE_UNITS)
         plain = _rotation_names(convention)
         names = by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
-        std = None
+        std = self.rotation_std  # of which the writer says that there are no values
         if rotation_std:
-            given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
+            given = std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
             std = by_frame("rotation_std", given, "three names", 3)
         angle = unit if count == 3 or rotation_std else None
         return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
@@ -151,6 +193,21 @@ class TableFormat:
             raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
         if unit is not None:
             check_choice("rotation_angle", unit, ANGLE_UNITS)
+
+
+def options_of(table: TableFormat) -> list[str]:
+    """The options with which the command line reads positions or poses that are written so, word by word."""
+    lever = f"{table.lever * table.per_metre:.17g}" if table.rotation and table.lever != LEVER else None
+    texts = {field.name: getattr(table, field.name) for field in fields(table)}
+    texts |= {"position": table.triples, "lever": lever, "joints": ",".join(table.joints)}
+    texts |= {"std": ",".join(flat_names(table.std))}
+    words = list[str]()
+    for name, value in texts.items():
+        if value and name not in ("kinds", "on", "sockets", "readings"):
+            option = f"--{name.replace('_', '-')}"
+            each = [value] if isinstance(value, str) else [] if value is True else map(",".join, value)
+            words += [option] if value is True else [word for text in each for word in (option, text)]
+    return words
 
 
 def flat_names(names: Names | None) -> tuple[str, ...]:

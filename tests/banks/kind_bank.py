@@ -32,7 +32,6 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.images import ImageColumns
-from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
@@ -303,9 +302,9 @@ class Kind:
     def table(self, which: str = "data") -> tuple[Path, list[str]]:
         """The file of ``data``, ``new`` or ``moved``, and what a command is told of it."""
         path = self.folder / f"{which}.csv"
-        return path, [*UNITS, *table_options(*self.written(getattr(self, which), path))]
+        return path, [*UNITS, *table_options(self.written(getattr(self, which), path))]
 
-    def written(self, rows: Any, path: Path) -> tuple[TableColumns, TableFormat]:
+    def written(self, rows: Any, path: Path) -> TableFormat:
         named = rows.with_joint_names(self.robot.joint_names)
         turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in (*WITH_POSES, "inclinations") else {}
         table = TableFormat("mm", "deg", camera_on_tool=self.name in ON_TOOL, **turned)  # pyright: ignore
@@ -341,26 +340,26 @@ def _each(option: str, values: Any) -> list[str]:
     return [word for value in values for word in (option, str(value))]
 
 
-def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
+def table_options(table: TableFormat) -> list[str]:
     """The options that describe a table written by :func:`write_measurements`, but for its units."""
-    found = _each("--position", [",".join(triple) for triple in columns.position or ()])
+    found = _each("--position", [",".join(triple) for triple in table.position or ()])
     if table.rotation is not None:
         groups = [table.rotation] if isinstance(table.rotation[0], str) else table.rotation
         found += _each("--rotation", [",".join(names) for names in groups])
         found += ["--convention", str(table.convention), "--rotation-angle", str(table.rotation_angle)]
     found += ["--camera-on-tool"] * (
-        table.camera_on_tool or any(getattr(own, "camera_on_tool", 0) for own in columns.readings)
+        table.camera_on_tool or any(getattr(own, "camera_on_tool", 0) for own in table.readings)
     )
     found += ["--remounted"] * table.remounted
     found += [] if table.payload is None else ["--payload", table.payload]
-    if columns.sockets is not None:
-        known = columns.sockets
+    if table.sockets is not None:
+        known = table.sockets
         found += ["--socket", ",".join(known.names)]
         found += _each("--distance", [f"{a},{b}={1e3 * length}" for (a, b), length in (known.distances or {}).items()])
         found += [] if known.distance_std is None else ["--distance-std", str(1e3 * known.distance_std)]
-    found += _each("--reading", [_reading(own) for own in columns.readings])
-    devices: Any = (own.device for own in columns.readings if own.device)
-    session = columns.session or next(devices, None)
+    found += _each("--reading", [_reading(own) for own in table.readings])
+    devices: Any = (own.device for own in table.readings if own.device)
+    session = table.session or next(devices, None)
     return found + ([] if session is None else ["--session", session])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -35,7 +35,7 @@ def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements
 def read_table(path: Path, joints: Any, position: Any, table: TableFormat, **how: Any) -> Measurements:
     """Positions or poses in a format; options are those of the columns, and duplicates."""
     duplicates = how.pop("duplicates", "error")
-    return read_observations(path, TableColumns(joints, position, **how), table, duplicates=duplicates)
+    return read_observations(path, replace(table, joints=joints, position=position, **how), duplicates=duplicates)
 
 
 def random_rotations(count: int, seed: int = 0) -> Tensor:

@@ -176,10 +176,10 @@ def test_corners_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
 
 def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
     path = tmp_path / "corners.csv"
-    columns, table = write_measurements(path, data(), TableFormat("mm", "deg", camera_on_tool=True))
+    table = write_measurements(path, data(), TableFormat("mm", "deg", camera_on_tool=True))
     lines = path.read_text().splitlines()
     cells = lines[3].split(",")
     cells[1] = "12.5"
     path.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]))
     with pytest.raises(MeasurementError, match=r"image '0'.*line 4"):
-        read_observations(path, columns, table)
+        read_observations(path, table)

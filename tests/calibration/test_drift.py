@@ -156,8 +156,8 @@ def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
     both = dc.Observations.joined([data, heights])
     tables: tuple[Any, ...] = data, both
     for rows in tables:
-        columns, form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
-        read: Any = read_observations(tmp_path / "t.csv", columns, form)
+        form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
+        read: Any = read_observations(tmp_path / "t.csv", form)
         assert read.covariate_names == ("time", "temperature")
         assert_close(read.covariates, rows.covariates, rtol=1e-12, atol=0)
         assert_close(read.rows([3, 1]).covariates, rows.covariates[[3, 1]], rtol=1e-12, atol=0)

@@ -153,9 +153,9 @@ def test_written_and_read_in_its_own_unit(arm: SimulatedArm, tmp_path: Path) -> 
     turns = dc.Readings.of("tilt", q, angles, None, names, unit=("mrad", 1e3), std=1e-4, numbers=2)
     beams = readings(arm, q)
     for data, cell in ((turns, "1500."), (beams, f"{1e3 * float(beams.values[0]):.6f}"[:-2])):
-        columns, written = write_measurements(tmp_path / "t.csv", data, table)
+        written = write_measurements(tmp_path / "t.csv", data, table)
         assert cell in (tmp_path / "t.csv").read_text()
-        same: Any = read_observations(tmp_path / "t.csv", columns, written)
+        same: Any = read_observations(tmp_path / "t.csv", written)
         assert (same.kind, same.unit, same.device_names) == (data.kind, data.unit, data.device_names)
         assert_close(same.values, data.values, rtol=0, atol=1e-12)
         assert (same.std is None) == (data.std is None)

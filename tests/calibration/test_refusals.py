@@ -14,7 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_inliers
-from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -70,16 +70,15 @@ def doubted(robot: dc.Tree, data: dc.Measurements) -> None:
 
 @pytest.mark.slow
 def test_rows_that_no_reading_explains_are_warned_about() -> None:
-    """Two joints that count the other way; a tip before the joint that carries the marker."""
+    """A tip before the joint that carries the marker; two joints that count the other way have such a reading."""
     arm = SimulatedArm(seed=1)
     q, y = arm.measure(40, seed=2)
     signs = torch.tensor([1.0, 1.0, -1.0, 1.0, -1.0, 1.0], dtype=torch.float64)
     short = dc.Chain("short", "base_link", "wrist_link", arm.nominal.joints[:-2])
-    for robot, rows in ((arm.nominal, dc.Measurements(q * signs, y)), (short, dc.Measurements(q[:, :5], y))):
-        with pytest.warns(
-            DiffeoCalibWarning, match=r"do not fit this robot, even with .* the tip link or DH convention"
-        ):
-            doubted(robot, rows)
+    with pytest.warns(DiffeoCalibWarning, match=r"do not fit this robot, even with .* the tip link or DH convention"):
+        doubted(short, dc.Measurements(q[:, :5], y))
+    with pytest.raises(MeasurementError, match=r"the rows fit, in degrees and mm, with joints=.*-\{elbow_joint\}"):
+        dc.calibrate(arm.nominal, dc.Measurements(q * signs, y))
 
 
 @pytest.mark.slow

@@ -234,4 +234,4 @@ def test_residuals_of_every_row(
     refused = command(
         "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--register", "--residuals", path
     )
-    assert "--fail-above and --residuals judge a model where it was fitted" in refused.error
+    assert "--residuals beside --register" in refused.error

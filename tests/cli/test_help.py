@@ -13,11 +13,11 @@ ROWS = (
 TEXTS = {
     "fit": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
-        "--duplicates --figure --note --scales-of --report --jobs"
+        "--duplicates --figure --note --scales-of --report"
     ),
     "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines --bag --seen "
-        "--joint-states --speed --once --candidates --page --next --accepted"
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines "
+        "--once --candidates --page --next --accepted"
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
@@ -35,12 +35,12 @@ TEXTS = {
     ),
     "plan": (
         f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
-        "--candidates --target-poses --measured --draw --range --tracker --facing --cone --floor --column --collisions "
+        "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
         "--sensor --payload-mass"
     ),
     "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",
-    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --level --seed --figure",
-    "report": f"{ROWS} {UNITS} MODEL -o --output --data --title --against --tolerance",
+    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --seed",
+    "report": f"{ROWS} {UNITS} MODEL -o --output --data --against --tolerance",
     "demo": "-o --output --rows --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
@@ -89,7 +89,6 @@ def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command)
     assert "[required]" in found["--robot"]
     assert "[required]" in found["CSV"]
     assert "required" not in found["--joints"]
-    assert "[default: ,]" in found["--sep"]
     assert "default: 0.3" in found["--holdout"]
     assert "0.0<=x<=0.9" in found["--holdout"]
     assert "<m|mm|cm|inch>" in command("fit", "--help").out

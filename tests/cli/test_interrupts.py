@@ -203,12 +203,3 @@ def test_ctrl_c_among_images_leaves_the_files_as_they_were(tmp_path: Path) -> No
     files = {tmp_path / "corners.csv": True, tmp_path / "corners.yaml": True, tmp_path / "page.html": False}
     more = ["-o", tmp_path / "corners.csv", "--overview", tmp_path / "page.html"]
     assert_cut_short(("diffeo_calib.cameras.folder", "_seen"), *words, *more, outputs=files)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["compare", "write_figure"])
-def test_ctrl_c_while_models_are_compared_leaves_the_figure_as_it_was(name: str, tmp_path: Path) -> None:
-    model = Path(__file__).parents[1] / "interop" / "data" / "robot_format_3.safetensors"
-    figure = tmp_path / "where.png"
-    words = ["compare", model, model, "--figure", figure]
-    assert_cut_short(("diffeo_calib.cli.commands.compare", name), *words, outputs={figure: True})

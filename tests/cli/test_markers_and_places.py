@@ -10,7 +10,7 @@ import torch
 from command_bank import Command
 from torch.testing import assert_close
 
-from diffeo_calib.cli.options import Places, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import Places, Rows, Units
 from diffeo_calib.cli.row_columns import with_places
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
 from diffeo_calib.measurements.csv.lines import read_cells
@@ -52,17 +52,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 def test_later_tables_have_the_markers_of_the_model() -> None:
     """The order of the markers is kept with the model, also where the column is typed."""
     command = f"{FIT} --marker smr --marker smr=b,a,c"
-    assert as_at_the_fit(command, Rows(), StoredUnits())[0].marker == "smr=b,a,c"
+    assert as_at_the_fit(command, Rows(), Units())[0].marker == "smr=b,a,c"
     for typed, expected in (("ball", "ball=b,a,c"), ("ball=c,a", "ball=c,a")):
         given = Rows(position=["x,y,z"], marker=typed)
-        assert as_at_the_fit(command, given, StoredUnits(length="m", angle="rad"))[0].marker == expected
-    assert as_at_the_fit(FIT, Rows(marker="ball"), StoredUnits())[0].marker == "ball"
+        assert as_at_the_fit(command, given, Units(length="m", angle="rad"))[0].marker == expected
+    assert as_at_the_fit(FIT, Rows(marker="ball"), Units())[0].marker == "ball"
 
 
 def test_the_file_of_places_is_that_of_its_table() -> None:
-    rows, _ = as_at_the_fit(FIT, Rows(), StoredUnits())
+    rows, _ = as_at_the_fit(FIT, Rows(), Units())
     assert rows == Rows(position=["x,y,z"])
-    rows, _ = as_at_the_fit(FIT, Rows(places=Path("new.csv")), StoredUnits())
+    rows, _ = as_at_the_fit(FIT, Rows(places=Path("new.csv")), Units())
     assert rows == Rows(position=["x,y,z"], places=Path("new.csv"), by="name")
 
 
@@ -126,8 +126,8 @@ def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Comman
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fit", "JOINTS", "--places", "PLACES"], "--places and --by belong together"),
-        (["fit", "JOINTS", "--by", "name"], "--places and --by belong together"),
+        (["fit", "JOINTS", "--places", "PLACES"], "--places without --by"),
+        (["fit", "JOINTS", "--by", "name"], "--by without --places"),
         (["campaign", "JOINTS", "--places", "PLACES", "--by", "name"], "--places or --marker, of a table that grows"),
         (["campaign", "WHOLE", "--marker", "reflector"], "--places or --marker, of a table that grows"),
         (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "`marker` (reflector): expected one position"),

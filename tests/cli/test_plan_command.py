@@ -25,7 +25,7 @@ def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
 
 def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> None:
     output = tmp_path / "poses.csv"
-    cell = ["--tracker", "2500,300,600", "--facing", "0,0,1", "--cone", 40, "--floor", 100]
+    cell = ["--tracker", "2500,300,600,0,0,1,40", "--floor", 100]
     cell += ["--range", "waist_joint=-60:90"]
     cell += ["--column", "600,0,80,400", "--marker", "50,0,100", "--draw", 200]
     done = command("plan", *site.robot(), "-n", 25, "-o", output, *UNITS, *cell)
@@ -71,28 +71,13 @@ def test_next_poses_and_poses_to_measure_again(
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["plan", "--target=p.csv", "-n", 3, "-o", "o.csv"], "--target-poses"),
-        (["correct", "m", "p.csv", "--payload", 5, "-o", "o.csv"], "--payload-mass"),
-    ],
-)
-def test_former_names_of_options_are_taken_with_a_warning(words: list[object], name: str, command: Command) -> None:
-    done = command(*words)
-    assert done.code == 1  # there are no such files
-    assert "warning" in done.err
-    assert name in done.err
-
-
-@pytest.mark.parametrize(
     ("options", "message"),
     [
         ([], "what to plan for: expected a MODEL, or --robot, got neither"),
-        (["MODEL", "--base", "x"], "--base beside a MODEL"),
-        (["MODEL", "--marker", "0,0,1"], "--marker beside a MODEL"),
-        (["ROBOT", "--free", "base"], "--free without a MODEL"),
-        (["ROBOT", "--cone", "30"], "--facing and --cone belong to --tracker"),
-        (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 numbers"),
+        (["MODEL", "--base", "x"], "--base beside MODEL"),
+        (["MODEL", "--marker", "0,0,1"], "--marker beside MODEL"),
+        (["ROBOT", "--free", "base"], "--free without MODEL"),
+        (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 or 6 or 7 numbers"),
         (["ROBOT", "--column", "1,2"], "--column 1,2: expected 3 or 4 numbers"),
         (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
         (["ROBOT", "--range", "elbow=1:2"], "`ranges` names ['elbow']"),

@@ -86,7 +86,7 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
     units = Units(length="mm", angle="deg", sep=";", decimal=",")
     table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
-    assert table.columns.readings == (columns,)
+    assert table.table.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
 
 
@@ -95,7 +95,7 @@ def test_a_number_that_names_a_column_is_that_column(tmp_path: Path) -> None:
     for text, values in {"7": ("7",), "7.0": 7.0}.items():
         rows, units = Rows(reading=[f"distance={text}"]), Units(length="mm", angle="deg")
         table = measured_table(tmp_path / "t.csv", rows, units)
-        assert table.columns.readings == (ReadingColumns("distance", values),)
+        assert table.table.readings == (ReadingColumns("distance", values),)
 
 
 @pytest.mark.parametrize(
@@ -147,4 +147,4 @@ def test_several_kinds_are_one_table(tmp_path: Path) -> None:
     data = measured_table(csv, rows, units).read(arm)
     assert (data.kinds, data.device_names) == (("position", "distance", "socket"), ["", "device", ""])
     named = measured_table(csv, Rows(reading=["distance=C"], session="who"), units)
-    assert named.columns.readings[0].device == "who"
+    assert named.table.readings[0].device == "who"

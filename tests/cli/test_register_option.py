@@ -102,7 +102,7 @@ def test_options_of_the_registration(fitted: Outcome, site: Site, command: Comma
     for options in (["--free", "base"], ["-o", tmp_path / "m"]):
         refused = command("evaluate", model, path, *TABLE, *options)
         assert refused.code == 1
-        assert refused.error.startswith("error: --free and -o belong to --register; add --register")
+        assert refused.error.startswith(f"error: {options[0]} without --register; ")
     onto = command("evaluate", model, path, *TABLE, "--register", "-o", model)
     assert onto.error == f"error: -o {model} is the file of MODEL; name another file."
     few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--register")

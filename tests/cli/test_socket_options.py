@@ -68,10 +68,10 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     [
         ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
-        (["--distance", "a,b=50", "--position", "x,y,z"], "--distance without --socket"),
+        (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
         (["--socket", "place,hole"], "no column ['hole']"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
-        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std; say how well"),
+        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
     ],

@@ -12,9 +12,9 @@ from command_bank import TABLE, Command, Outcome, Site
 from rich.console import Console
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Rows, StoredUnits
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.printed import ErrorTable
-from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table, stated_units
+from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table, table_format
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -27,25 +27,25 @@ FIT = (
 
 
 def test_columns_and_units_of_the_fit() -> None:
-    rows, units = as_at_the_fit(FIT, Rows(), StoredUnits())
+    rows, units = as_at_the_fit(FIT, Rows(), Units())
     assert rows == Rows(position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
-    assert (units.length, units.angle, units.sep, units.decimal) == ("mm", "deg", ";", ".")
+    assert (units.length, units.angle, units.sep, units.decimal) == ("mm", "deg", ";", None)
 
 
 def test_typed_options_win() -> None:
-    rows, units = as_at_the_fit(FIT, Rows(session="night"), StoredUnits(angle="rad"))
+    rows, units = as_at_the_fit(FIT, Rows(session="night"), Units(angle="rad"))
     assert (rows.session, rows.std, units.angle, units.length) == ("night", "s", "rad", "mm")
-    rows, units = as_at_the_fit(FIT, Rows(position=["x,y,z"]), StoredUnits(length="m", angle="rad"))
+    rows, units = as_at_the_fit(FIT, Rows(position=["x,y,z"]), Units(length="m", angle="rad"))
     assert rows == Rows(position=["x,y,z"])
-    assert units.sep == ",", "what states both units describes the whole format"
+    assert units.sep is None, "what states both units describes the whole format"
 
 
 def test_units_are_never_guessed() -> None:
     for command, missing in (("", "--length and --angle missing"), ("diffeo-calib fit --length m", "--angle missing")):
         with pytest.raises(InputError, match=missing):
-            as_at_the_fit(command, Rows(position=["x,y,z"]), StoredUnits())
+            table_format(as_at_the_fit(command, Rows(position=["x,y,z"]), Units())[1])
     with pytest.raises(InputError, match="--angle missing"):
-        stated_units(StoredUnits(length="m"))
+        table_format(Units(length="m"))
 
 
 @pytest.mark.parametrize(
@@ -55,8 +55,8 @@ def test_options_that_are_none_are_one_error(words: str) -> None:
     """Whoever sends a model file may have edited the line in it."""
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm {words}"
     with pytest.raises(InputError, match=r"the options that the model was fitted with: got .*; name the columns"):
-        as_at_the_fit(command, Rows(), StoredUnits())
-    rows, units = as_at_the_fit(command, Rows(position=["a,b,c"]), StoredUnits(length="m", angle="rad"))
+        as_at_the_fit(command, Rows(), Units())
+    rows, units = as_at_the_fit(command, Rows(position=["a,b,c"]), Units(length="m", angle="rad"))
     assert (rows.position, units.angle) == (["a,b,c"], "rad")  # nothing of it is needed
 
 
@@ -65,7 +65,7 @@ def test_a_separator_that_is_none_is_one_error(sep: str, tmp_path: Path) -> None
     (tmp_path / "t.csv").write_text("q1,x,y,z\n")
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep '{sep}'"
     with pytest.raises(InputError, match="`sep`: expected one character"):
-        rows_in_table(tmp_path / "t.csv", *as_at_the_fit(command, Rows(), StoredUnits()))
+        rows_in_table(tmp_path / "t.csv", *as_at_the_fit(command, Rows(), Units()))
 
 
 @pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])
@@ -74,7 +74,7 @@ def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     command = f"diffeo-calib fit t.csv --reading corners={place} --length mm --angle deg"
-    rows, units = as_at_the_fit(command, Rows(), StoredUnits())
+    rows, units = as_at_the_fit(command, Rows(), Units())
     with pytest.raises(InputError, match=r"(is|there is) no file.* check the path of the camera file"):
         measured_table(tmp_path / "t.csv", rows, units)
 
@@ -110,7 +110,7 @@ def test_tables_read_in_python(site: Site, tmp_path: Path) -> None:
     read = dc.read_measurements(
         tmp_path / "t.csv", site.arm.nominal, ["x", "y", "z"], convention="XYZ", rotation_angle="deg", **given
     )
-    rows, units = as_at_the_fit(read.origin.options, Rows(), StoredUnits())  # pyright: ignore
+    rows, units = as_at_the_fit(read.origin.options, Rows(), Units())  # pyright: ignore
     again = measured_table(tmp_path / "t.csv", rows, units).read(site.arm.nominal)
     assert again.sha256 == read.sha256
     assert again.lever == pytest.approx(0.05, rel=1e-15)

@@ -18,7 +18,7 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.joint_ranges import OutsideRange, joints_outside_range, warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 
 
@@ -196,21 +196,16 @@ def test_joint_values_in_the_other_unit_of_angles_are_noticed(factor: float, uni
     """Small values may be a small motion."""
     words = rf"seem to be {unit}.*; check the angle unit"
     for q in (arm.test.q[:40], arm.test.q[:40] - arm.test.q[:40].mean(0) + arm.train.q.mean(0)):
-        found = OutsideRange(arm.model)
-        for row in factor * q:
-            found.add(row[None])
         small = pytest.warns(dc.DiffeoCalibWarning, match=words)
         with small if factor < 1 else pytest.raises(MeasurementError, match=words):
-            found.refuse_other_unit()
+            refuse_other_angles(arm.model, factor * q)
 
 
 def test_small_motions_are_not_refused(arm: Case) -> None:
-    few, near, whole = OutsideRange(arm.model), OutsideRange(arm.model), OutsideRange(arm.model)
-    few.add(arm.train.q.mean(0)[None] + 1e-3)
-    near.add(arm.train.q.mean(0) + 1e-4 * (arm.train.q - arm.train.q.mean(0)))
-    whole.add(arm.train.q)
-    for found in (few, near, whole, OutsideRange(arm.model)):
-        found.refuse_other_unit()
+    few = arm.train.q.mean(0)[None] + 1e-3
+    near = arm.train.q.mean(0) + 1e-4 * (arm.train.q - arm.train.q.mean(0))
+    for q in (few, near, arm.train.q, arm.train.q[:0]):
+        refuse_other_angles(arm.model, q)
 
 
 def test_implausible_errors_have_a_sentence(arm: Case) -> None:

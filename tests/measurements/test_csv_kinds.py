@@ -17,7 +17,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.columns import Group
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
 from diffeo_calib.measurements.csv.images import ImageColumns
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import TableFormat
@@ -114,20 +114,20 @@ def assert_same(found: Any, wanted: Any) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: Path) -> None:
     data = KINDS[kind]()
-    columns, form = write_measurements(tmp_path / "t.csv", data, table)
-    again = read_observations(tmp_path / "t.csv", columns, form)
+    form = write_measurements(tmp_path / "t.csv", data, table)
+    again = read_observations(tmp_path / "t.csv", form)
     assert_same(again, data)
     assert again.lines.tolist() == list(range(2, 2 + len(data)))
     assert len(again.sha256) == 64
     shuffled = data.rows([3, 1, 0, 2])
-    columns, form = write_measurements(tmp_path / "s.csv", shuffled, table)
-    assert_close(read_observations(tmp_path / "s.csv", columns, form).q, data.q[[3, 1, 0, 2]])
+    form = write_measurements(tmp_path / "s.csv", shuffled, table)
+    assert_close(read_observations(tmp_path / "s.csv", form).q, data.q[[3, 1, 0, 2]])
 
 
 def test_shuffled_rows_of_several_kinds_keep_their_order(tmp_path: Path) -> None:
     data = KINDS["all"]().rows([27, 3, 14, 0, 20, 8, 22, 9, 12, 13])
-    columns, form = write_measurements(tmp_path / "t.csv", data, DEGREES)
-    found = read_observations(tmp_path / "t.csv", columns, form)
+    form = write_measurements(tmp_path / "t.csv", data, DEGREES)
+    found = read_observations(tmp_path / "t.csv", form)
     assert_close(found.q, data.q)
     assert sorted(found.kinds) == sorted(data.kinds)
     assert found.kinds == data.kinds
@@ -151,9 +151,9 @@ def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: P
     """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
     path = tmp_path / "t.csv"
     path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,s,1,1,5,5\n1,2,,,,{cells}\n")
-    columns = TableColumns(NAMES, list("xyz"), readings=(ImageColumns((640, 480)),))
+    table = replace(SI, joints=NAMES, position=list("xyz"), readings=(ImageColumns((640, 480)),))
     with pytest.raises(MeasurementError, match=says("line 4", f"column '{column}'", "an empty cell")):
-        read_observations(path, columns, SI)
+        read_observations(path, table)
 
 
 def test_whole_numbers_are_units() -> None:
@@ -169,12 +169,12 @@ LINES = """a,b,x,y,z,d,u,v,spot,who,sd
 """
 WIRE = ReadingColumns("distance", ("d",), "who", std=("sd",))
 CAMERA = ReadingColumns("image", ("u", "v"), "who", intrinsics=(2.0, 2.0, 0.0, 0.0))
-COLUMNS = TableColumns(NAMES, list("xyz"), SocketColumns(("spot",)), (WIRE, CAMERA))
+COLUMNS = replace(SI, joints=NAMES, position=list("xyz"), sockets=SocketColumns(("spot",)), readings=(WIRE, CAMERA))
 
 
-def read(tmp_path: Path, text: str, columns: TableColumns = COLUMNS, **options: Any) -> Any:
+def read(tmp_path: Path, text: str, table: TableFormat = COLUMNS, **options: Any) -> Any:
     (tmp_path / "t.csv").write_text(text)
-    return read_observations(tmp_path / "t.csv", columns, SI, **options)
+    return read_observations(tmp_path / "t.csv", table, **options)
 
 
 def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
@@ -211,10 +211,10 @@ def test_bad_lines_are_named(edit: tuple[str, str], said: str, tmp_path: Path) -
 def test_bad_descriptions(tmp_path: Path) -> None:
     plane = ReadingColumns("height", 0.0)
     for columns, said in (
-        (TableColumns(NAMES), "`position` is missing"),
+        (replace(SI, joints=NAMES), "`position` is missing"),
         (replace(COLUMNS, readings=(plane,)), "one height for all rows beside rows of other kinds"),
         (replace(COLUMNS, position=None, session="who"), "`session` beside `socket`"),
-        (TableColumns(NAMES, readings=(WIRE,), session="who"), "`session` beside `readings`"),
+        (replace(SI, joints=NAMES, readings=(WIRE,), session="who"), "`session` beside `readings`"),
         (replace(COLUMNS, readings=(replace(WIRE, values=("rope",)),)), "no column ['rope']"),
     ):
         with pytest.raises(MeasurementError, match=says(said)):
@@ -290,8 +290,8 @@ def test_kinds_share_a_column_of_deviations_in_one_unit_alone(tmp_path: Path) ->
     text = "a,b,d,h,sd,who\n0,1,5,,0.1,A\n1,2,,7,0.2,B\n"
     wire = ReadingColumns("distance", ("d",), "who", std=("sd",))
     plane = replace(wire, kind="height", values=("h",))
-    data = read(tmp_path, text, TableColumns(NAMES, readings=(wire, plane)))
+    data = read(tmp_path, text, replace(SI, joints=NAMES, readings=(wire, plane)))
     assert [held(part.std).tolist() for part in data.parts] == [[[0.1]], [[0.2]]]
     angle = replace(plane, kind="angle", unit=("mrad", 1e3))
     with pytest.raises(MeasurementError, match=says("distinct columns", "'sd'")):
-        read(tmp_path, text, TableColumns(NAMES, readings=(wire, angle)))
+        read(tmp_path, text, replace(SI, joints=NAMES, readings=(wire, angle)))

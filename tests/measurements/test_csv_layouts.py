@@ -13,7 +13,6 @@ from diffeo_calib.cli.guesses import guess_joints, guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 NAMES = ["q1", "q2", "x", "y", "z"]
@@ -248,8 +247,8 @@ def test_rows_that_count_the_columns_and_empty_headers(read: Reader, tmp_path: P
 def test_a_growing_table_keeps_every_row(tmp_path: Path) -> None:
     """Rows that come one by one cannot be judged by those that come later."""
     (tmp_path / "table.csv").write_text(lost(3))
-    columns = TableColumns(NAMES[:2], [tuple(NAMES[2:])])
-    assert len(read_observations(tmp_path / "table.csv", columns, TableFormat(**FORMAT), growing=True)) == 8
+    table = TableFormat(**FORMAT, joints=NAMES[:2], position=[tuple(NAMES[2:])])
+    assert len(read_observations(tmp_path / "table.csv", table, growing=True)) == 8
 
 
 def test_joints_without_names_are_the_first_columns() -> None:

@@ -53,9 +53,9 @@ def test_a_marker_seen_again_is_another_row(tmp_path: Path) -> None:
 def test_later_tables_keep_the_order_of_the_markers(tmp_path: Path) -> None:
     whole = read(tmp_path)
     assert isinstance(whole.origin, TableOrigin)
-    assert whole.origin.marker == "ball=top,left,low"
+    assert whole.origin.columns.table.marker == "ball=top,left,low"
     assert "--marker ball=top,left,low" in whole.origin.options
-    some = read(tmp_path, LINES[3:], marker=whole.origin.marker)
+    some = read(tmp_path, LINES[3:], marker=whole.origin.columns.table.marker)
     assert some.marker_names == whole.marker_names
     assert some.visible.tolist() == [[True, False, True], [False, False, True]]
     assert_close(some.points[0], torch.where(some.visible[0, :, None], whole.points[1], torch.nan), equal_nan=True)

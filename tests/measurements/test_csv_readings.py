@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 MM = TableFormat("mm", "deg", ";", ",")
@@ -18,7 +19,7 @@ LINES = ("a;b;d;u;v;where", "10,5;20;400,25;12;7;north", "", "30;-40;410,5;13,5;
 
 
 def read(path: Path, columns: ReadingColumns, table: TableFormat, **options: str) -> dc.Readings:
-    return read_observations(path, TableColumns(["a", "b"], readings=(columns,)), table, **options)
+    return read_observations(path, replace(table, joints=["a", "b"], readings=(columns,)), **options)
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def table(tmp_path: Path) -> Path:
 
 def test_lengths_angles_and_devices_in_si(table: Path) -> None:
     data = read_observations(
-        table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",), "where", offset_std=0.1),)), MM
+        table, replace(MM, joints=["a", "b"], readings=(ReadingColumns("distance", ("d",), "where", offset_std=0.1),))
     )
     assert_close(data.values[:, 0].tolist(), [0.40025, 0.4105, 0.42])
     assert_close(data.q[0].rad2deg().tolist(), [10.5, 20.0])
@@ -43,13 +44,13 @@ def test_lengths_angles_and_devices_in_si(table: Path) -> None:
 def test_one_number_for_all_rows_and_pixels(table: Path) -> None:
     assert (
         read_observations(
-            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", 400.0),)), MM
+            table, replace(MM, joints=["a", "b"], readings=(ReadingColumns("distance", 400.0),))
         ).values.tolist()
         == [[0.4]] * 3
     )
     assert (
         read_observations(
-            table, TableColumns(["a", "b"], readings=(ReadingColumns("height", 0.0),)), MM
+            table, replace(MM, joints=["a", "b"], readings=(ReadingColumns("height", 0.0),))
         ).values.tolist()
         == [[0.0]] * 3
     )
@@ -82,11 +83,11 @@ def test_copies_are_dropped_on_demand_and_other_units_doubted(table: Path) -> No
     table.write_text(table.read_text().replace("50;60;420", "10,5;20;400,25"))
     with pytest.warns(dc.DiffeoCalibWarning, match="dropped 1 line"):
         data = read_observations(
-            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), MM, duplicates="drop"
+            table, replace(MM, joints=["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), duplicates="drop"
         )
     assert len(data) == 2
     metres = TableFormat("m", "deg", ";", ",")
     with pytest.warns(dc.DiffeoCalibWarning, match=r"distances reach 410.5 m: they look like millimetres"):
         read_observations(
-            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), metres, duplicates="keep"
+            table, replace(metres, joints=["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), duplicates="keep"
         )

@@ -178,10 +178,10 @@ def test_standard_deviations_of_points_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("poses", "options", "message"),
     [
-        (False, {"convention": "rotvec"}, ("`convention`", "without poses", "leave it out")),
-        (False, {"rotation": ["a", "b", "c"], "rotation_angle": "deg"}, ("`rotation` and `rotation_angle`",)),
-        (False, {"std": ["a", "b", "c"]}, ("`std`", "without standard deviations")),
-        (True, {"rotation_std": ["a", "b", "c"]}, ("`rotation_std`", "without standard deviations")),
+        (False, {"convention": "rotvec"}, ("`convention` without `rotation`", "leave this out")),
+        (False, {"rotation": ["a", "b", "c"], "rotation_angle": "deg"}, ("`rotation` is given",)),
+        (False, {"std": ["a", "b", "c"]}, ("['a', 'b', 'c']", "without these values")),
+        (True, {"rotation_std": ["a", "b", "c"]}, ("['a', 'b', 'c']", "without these values")),
         (True, {"convention": "euler"}, ("`convention`", "got 'euler'")),
         (True, {"rotation_angle": "turns"}, ("`rotation_angle`", "'rad' or 'deg'")),
         (True, {"rotation": ["a", "b"]}, ("`rotation`", "3 names")),

@@ -81,9 +81,9 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     write_measurements(tmp_path / "again.csv", data, table, joints=texts, kinds=kinds)
     assert (tmp_path / "again.csv").read_text().startswith("A,B,s,x,y,z")
     assert_close(read_joints(tmp_path / "again.csv", texts, table, kinds=kinds), expected)
-    columns = Columns.of(table, texts, kinds, [])
+    columns = Columns.of(table.joints_only(texts, kinds))
     program = Program.read(tmp_path / "t.csv", table)
-    program.write(tmp_path / "new.csv", expected + 0.01, columns, {}, table)
+    program.write(tmp_path / "new.csv", columns.from_si({"q": expected + 0.01}), table)
     assert_close(read_joints(tmp_path / "new.csv", texts, table, kinds=kinds), expected + 0.01)
 
 

@@ -44,7 +44,7 @@ def test_there_and_back(convention: str, length: str, angle: str, tmp_path: Path
     own = PoseColumns(columns.columns, convention, robot)
     q = read_joints(path, own, table)
     assert_close(robot(q), told, rtol=0, atol=1e-12)
-    again = Columns.of(table.joints_only(), own, None, []).joints_from_si(q)
+    again = Columns.of(table.joints_only(own)).joints_from_si(q)
     back = PoseColumns(columns.columns, convention, angle=angle).poses(again)
     assert_close(back[:, :3, :3], told[:, :3, :3], rtol=0, atol=1e-12)
     assert_close(again[:, :3], cells[:, :3], rtol=1e-12, atol=1e-12)

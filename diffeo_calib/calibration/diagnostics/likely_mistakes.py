@@ -33,9 +33,11 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
@@ -196,14 +198,10 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
     in_tip = (geometry.marker_poses(data.q)[:, 0, :3, :3].cpu().mT @ error[:, :, None])[:, :, 0]
     for column, texts in data.origin.texts(data.line_numbers).items():
         names = list(dict.fromkeys(texts))
-        if not 1 < len(names) <= gates.MOST_MARKERS or column in {*columns.names, data.origin.session}:
+        if not 1 < len(names) <= gates.MOST_MARKERS or column in {*columns.names, columns.table.session}:
             continue
         rows = torch.tensor([[text == name for name in names] for text in texts], dtype=error.dtype, device=HOST)
-        if (
-            float(rows.sum(0).min()) < gates.MARKER_ROWS
-            or "" in names
-            or column in {*columns.names, data.origin.session}
-        ):
+        if float(rows.sum(0).min()) < gates.MARKER_ROWS or "" in names:
             continue
         means = [rows.mT @ own / rows.sum(0)[:, None] for own in (in_tip, error)]
         left = [float((own - rows @ mean).norm()) for own, mean in zip((in_tip, error), means, strict=True)]
@@ -303,14 +301,17 @@ def convention_words(found: Sequence[Convention], columns: Columns | None) -> st
         names, units, what = found[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
     else:
         names, units, what = columns.joints.columns, (columns.table.angle, columns.table.joints_per_metre), ""
-        found = [own.of_columns(columns.joints.matrix, columns.joints.offset, *units) for own in found]
+        read = JointExpressions.of(columns.joints.texts)
+        found = [own.of_columns(read.matrix, read.offset, *units) for own in found]
     texts = [f"joints='{','.join(own.texts(names, *units))}'" for own in found]
     doubt = ", which these rows do not tell apart" if len(texts) > 1 else ""
     return f"the rows fit{what} with {' or '.join(texts)}{doubt}"
 
 
 def _conventions(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Joint values in another convention."""
+    """Joint values in another convention; none of a machine that is told poses."""
+    if is_cartesian(robot):
+        return
     columns, own = rotations.numeric_table(data)[0], Reading.of(robot, data)
     found = conventions_of(robot, data, "rad" if columns is None else columns.table.angle)
     for one in found[:1]:

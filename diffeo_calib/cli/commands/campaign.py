@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import chain
 from queue import Empty
@@ -13,7 +12,7 @@ from threading import Thread
 import typer
 
 from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import ID, Inbox, read_lines
+from diffeo_calib.campaign.feeds import Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
@@ -21,13 +20,11 @@ from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.models import robot_of
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
+from diffeo_calib.cli.tables import joint_columns, measured_table
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.bags import read_bag
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
-from diffeo_calib.measurements.stops import rows_of, stops
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
@@ -45,7 +42,7 @@ def run(given: CampaignOptions) -> None:
     if isinstance(source.joints, PoseColumns):
         fix = "measure with --robot and joint values, or fit the table when it is complete"
         raise InputError.of("--robot-pose of a table that grows: the middle of all poses is not known yet", fix=fix)
-    robot, played = robot_of(given.robot, source), _stops(source, given)
+    robot = robot_of(given.robot, source)
     names = joint_columns(source.joints, robot)
     candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
     with ExitStack() as stack:
@@ -57,9 +54,6 @@ def run(given: CampaignOptions) -> None:
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))
         if page is not None:
             live.say(f"the campaign is shown at {page.url}", {"shown": page.url})
-        if given.bag is not None:
-            left = [row for row in played if live.known(row) is None]
-            Thread(target=play, args=(left, inbox, given.speed), daemon=True).start()
         code = _followed(live, given, inbox, page)
         _end(live)
     if given.accepted is not None:
@@ -67,32 +61,6 @@ def run(given: CampaignOptions) -> None:
         write_whole(given.accepted, live.table.header + b"".join(live.lines[number] for number in numbers))
     if code:
         raise typer.Exit(code)
-
-
-def _stops(source: MeasuredTable, given: CampaignOptions) -> list[dict[str, float]]:
-    """The stops of a bag; InputError for a table in other units."""
-    if given.bag is None or given.seen is None:
-        return []
-    units = source.table.length, source.table.joint_length or source.table.length, source.table.angle
-    if units != ("m", "m", "rad"):
-        got = f"--length {units[0]}, --angle {units[2]}"
-        raise InputError.of("the stops of --bag are in m and rad", got=got, fix="add --length m --angle rad")
-    joints, names, seen = read_bag(given.bag, given.joint_states, given.seen)
-    if not seen.values.shape[1]:
-        fix = "use `record`, then `images`"
-        raise InputError.of(f"{given.seen} of --bag", expected="places that a device measured", got="images", fix=fix)
-    return [{ID: number, **row} for number, row in enumerate(rows_of(names, stops(joints, seen)[0]))]
-
-
-def play(
-    rows: Sequence[dict[str, float]], inbox: Inbox, speed: float, sleep: Callable[[float], object] = time.sleep
-) -> None:
-    """Put rows into an inbox at their times [s], then None."""
-    begin = time.monotonic() - rows[0]["time"] / speed if rows else 0.0
-    for row in rows:
-        sleep(max(begin + row["time"] / speed - time.monotonic(), 0.0))
-        inbox.put(row)
-    inbox.put(None)
 
 
 def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:

@@ -7,14 +7,12 @@ from pathlib import Path
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
 from diffeo_calib.cli.commands.recalibrate import change_entries, change_lines, doubt, smallest_lines
-from diffeo_calib.cli.console import plain, say
+from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import CompareOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import write_figure
-from diffeo_calib.reports.plots.joints import comparison
 
 
 def is_model(path: Path) -> bool:
@@ -32,14 +30,12 @@ def run(given: CompareOptions) -> None:
         if given.rows.named or given.units.length or given.units.angle:
             fix = "leave out the options of tables, or name a table"
             raise InputError.of(f"{given.other} is a model, beside options of a table", fix=fix)
-        return _models(given.old, given.other, given.tests.seed, given.figure)
-    if given.figure is not None:
-        raise InputError.of("--figure beside a table", expected="another model", fix="leave it out")
+        return _models(given.old, given.other, given.tests.seed)
     model = load_kinematics(given.old)
     source = table_of(model, given.other, given.rows, given.units)
     say(*provenance_lines(model), *another_date_lines(model))
     how = {"marker": given.tests.marker_freedom, "seed": given.tests.seed}
-    found = compare(model, source.read(model.robot), level=given.level, **how)
+    found = compare(model, source.read(model.robot), **how)
     if not isinstance(found, Comparison):
         return None
     record.add(
@@ -57,17 +53,14 @@ def run(given: CompareOptions) -> None:
     say(*(change_lines(found.changes) if found.changes.found else [str(found), *smallest_lines(found.changes)]))
 
 
-def _models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
-    """Compare two models, and draw where they differ."""
+def _models(old: Path, other: Path, seed: int) -> None:
+    """Compare two models."""
     models = [load_kinematics(path) for path in (old, other)]
     for model in models:
         say(*provenance_lines(model))
     found = compare(models[0], models[1], seed=seed)
     if not isinstance(found, ModelComparison):
         return
-    if figure is not None:
-        title = f"{plain(other.name)} minus {plain(old.name)}"
-        write_figure(comparison(found, models[0].robot, title), figure)
     record.add(
         rms_m=found.rms,
         expected_m=found.expected,
@@ -75,7 +68,7 @@ def _models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         geodesic_length=found.geodesic_length,
         changes=change_entries(found.changes)["changes"],
         transmissions_rad_or_m=found.transmissions,
-        files={} if figure is None else {"figure": figure},
+        files={},
     )
     say(str(found))
     for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
@@ -83,5 +76,3 @@ def _models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
             f"{1e3 * change:.3f} mm" if kind == "prismatic" else f"{1e3 * change:.3f} mrad ({degrees(change):.4f} deg)"
         )
         say(f"  transmission of {name}: {size} RMS")
-    if figure is not None:
-        say(f"figure: {figure}")

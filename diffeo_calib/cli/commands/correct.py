@@ -18,7 +18,7 @@ from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-from diffeo_calib.kinematics.joint_ranges import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.writing import Column, Program
@@ -84,14 +84,15 @@ def run(options: CorrectOptions) -> None:
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
     robot, tools = kinematics.robot, _tools(kinematics, options, table)
-    columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
+    columns = Columns.of(table.joints_only(joint_columns(source.joints, robot), robot.kinds))
     sheet = Program.read(program, table, columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
     sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
     sheet.check_free([tool.name("std", table.length) for tool in tools])
-    warn_outside_range(kinematics, start, refuse_other_unit=True)
+    refuse_other_angles(kinematics, start)
+    warn_outside_range(kinematics, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)
@@ -102,7 +103,7 @@ def run(options: CorrectOptions) -> None:
         found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     allowed = found.q.isfinite().all(1)
     known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
-    sheet.write(output, found.q, columns, _added(kinematics, found, tools, known, table), table)
+    sheet.write(output, columns.from_si({"q": found.q}) | _added(kinematics, found, tools, known, table), table)
     misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
     record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": output})
     _summarise(kinematics, found, tools, sheet.lines)

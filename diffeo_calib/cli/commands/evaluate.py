@@ -58,7 +58,7 @@ def run(options: EvaluateOptions) -> None:
     if options.register:
         return _registered(model, path.name, data, options.free or "both", options.output)
     check_rows(model, data)
-    places = place(model, data, every_session=source.columns.session is not None)
+    places = place(model, data, every_session=source.table.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
     judged = judge(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), path.name)

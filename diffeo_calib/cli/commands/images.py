@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 from diffeo_calib.cameras.board import BoardPrior
@@ -16,6 +14,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.table_format import TableFormat
 
 
@@ -24,17 +23,16 @@ def run(given: ImagesOptions) -> None:
     output, table = given.output, TableFormat(given.length, "rad", given.sep, given.decimal)
     with progress_bar() as progress:
         found = read_folders(given.folders, given.joints, Board.of(given.board), table.sep, progress)
-    text, several = io.StringIO(newline=""), len(found) > 1
-    sheet = csv.writer(text, delimiter=table.sep)
-    sheet.writerow([IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several])
+    several = len(found) > 1
+    lines = [[IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several]]
     cameras, contents, refused = dict[str, Path](), dict[Path, bytes](), dict[str, str]()
     for one in found:
-        sheet.writerows([*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal))
+        lines += [[*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal)]
         cameras[one.name] = output.with_name(f"{one.name}.yaml") if several else output.with_suffix(".yaml")
         contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
         own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
         refused |= {name: reason for name, reason in own.items() if reason}
-    contents[output] = text.getvalue().encode()
+    contents[output] = csv_text(lines, table.sep)
     if given.overview is not None:
         contents[given.overview] = page(found).encode()
     write_together(contents)

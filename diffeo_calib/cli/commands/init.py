@@ -17,7 +17,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_R
 from diffeo_calib.cli import proposals, told_poses
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
+from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Source
@@ -42,8 +42,7 @@ NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
-COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "session", "payload", "reading", "by")
-COLUMNS = (*COLUMNS, "time", "temperature")
+COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED)
 """Entries that name columns."""
 
 
@@ -189,7 +188,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 guessed = guess_joints(sheet.numbers, chain.joint_names) or [JointColumns(arm.columns, arm.how, ())]
                 seen, names = proposals.joint_columns(seen, guessed)
                 seen = proposals.measured(seen)
-                seen = replace(seen, marker=proposals.marker(seen, sheet))
+                seen = replace(seen, marker=proposals.marker(seen))
                 units = list(_units(seen))
                 meant = [choice for choice in units if choice.name == "joints"]
                 names = meant or names
@@ -197,7 +196,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
                 units = [choice for choice in units if choice.name != "joints"]
                 if meant:  # the robot explains the rows only now
                     seen = proposals.measured(seen)
-                    seen = replace(seen, marker=seen.marker or proposals.marker(seen, sheet))
+                    seen = replace(seen, marker=seen.marker or proposals.marker(seen))
                 one = _with_tip(robot, Explained(arm, "", seen, names, units))
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:

@@ -17,10 +17,10 @@ from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates
+from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, stated_units, table_format
+from diffeo_calib.cli.tables import joint_columns, joints_of, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -61,7 +61,7 @@ def run(given: PlanOptions) -> None:
     cell, count, output = given.cell, given.count, given.output
     with exit_on_interrupt(), progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
-        stated = stated_units(given.units) if model is None else as_fitted(model, None, given.units)[1]
+        stated = given.units if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
         source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
@@ -113,14 +113,12 @@ def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
 def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
     """What random configurations have to respect, in m and rad: arguments of :func:`drawn`."""
     scale = table.per_metre
-    if cell.tracker is None and not (cell.facing is None and cell.cone is None):
-        raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
     found: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
     if cell.tracker is not None:
-        position = [x / scale for x in _numbers("--tracker", cell.tracker, (3,))]
-        direction = _numbers("--facing", cell.facing or "0,0,1", (3,))
-        cone = FACING_HALF_ANGLE_DEG if cell.cone is None else cell.cone
-        found["tracker"] = Tracker(position, direction=direction, half_angle=radians(cone))
+        x, y, z, *seen = _numbers("--tracker", cell.tracker, (3, 6, 7))
+        looks = (seen[:3], *map(radians, seen[3:])) if seen else ()
+        how: dict[str, Any] = dict(zip(("direction", "half_angle"), looks, strict=False))
+        found["tracker"] = Tracker((x / scale, y / scale, z / scale), **how)
     if cell.column is not None:
         found["column"] = [x / scale for x in _numbers("--column", cell.column, (3, 4))]
     if cell.floor is not None:

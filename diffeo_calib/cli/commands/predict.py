@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.cli.console import Progress, progress_bar, say
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
@@ -19,29 +20,18 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
-from diffeo_calib.kinematics.joint_ranges import OutsideRange
+from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
-from diffeo_calib.measurements.csv.files import open_joints
+from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
-from diffeo_calib.measurements.table_format import TableFormat, flat_names
+from diffeo_calib.measurements.table_format import TableFormat, options_of
 
-Laden = tuple[Tensor, Tensor | None]
-"""Joint values (B, n) and payloads (B,) of some rows."""
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
     "rigid motion of all of them; `evaluate --register` with measured positions finds it"
 )
-
-
-def counted(blocks: Iterable[Laden], rows: int, progress: Progress) -> Iterator[Laden]:
-    """The same blocks of rows; the bar moves when each has been used."""
-    done = 0
-    progress("rows", done, rows)
-    for block in blocks:
-        yield block
-        done += len(block[0])
-        progress("rows", done, rows)
 
 
 def run(given: PredictOptions) -> None:
@@ -64,18 +54,24 @@ def run(given: PredictOptions) -> None:
         check_payload_column(kinematics, table.payload)
     prefixes = kinematics.bodies.prefixes(kinematics)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
-    with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
-        outside = OutsideRange(kinematics)  # all mistakes in the table are found before anything is written
-        file.check(lambda values: outside.add(values["q"]), lambda part: progress("checking, %", int(100 * part), 100))
-        outside.refuse_other_unit()
-        outside.warn()
-        laden = counted(file.laden_joints(), file.rows, progress)
-        blocks = (_predicted(readings, kinematics, *rows) for rows in laden)
+    values = read_configurations(given.csv, names, table, kinds=robot.kinds)
+    q, masses = values["q"], values.get("payload")
+    refuse_other_angles(kinematics, q)
+    warn_outside_range(kinematics, q)
+
+    def blocks() -> Iterator[Predictions]:
+        """Predictions of some rows at a time."""
+        for first in range(0, len(q), ROWS_AT_ONCE):
+            progress("rows", first, len(q))
+            own = slice(first, first + ROWS_AT_ONCE)
+            yield _predicted(readings, kinematics, q[own], None if masses is None else masses[own])
+
+    with progress_bar() as progress:
         how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
-        write_predictions(output, blocks, table, joints=names, **how)
-    record.add(rows=file.rows, files={"table": output})
+        write_predictions(output, blocks(), table, joints=names, **how)
+    record.add(rows=len(q), files={"table": output})
     what = "poses" if with_poses else "positions"
-    say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if kinematics.own_frame:
         say(OWN_FRAME)
     say(*readings.sentences())
@@ -98,13 +94,11 @@ def _written_as_read(
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    options = []
-    for prefix in prefixes:
-        written = table.for_writing(rotation_std=False, prefixes=[prefix])
-        columns = flat_names(written.rotation)
-        unit = f" --rotation-angle {written.rotation_angle}" * (len(columns) == 3)
-        options += [f"--position {','.join(prefix + axis for axis in 'xyz')} --rotation {','.join(columns)}"]
-    return f"{' '.join(options)} --convention {written.convention}{unit}"
+    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), table.joints_only(())
+    position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
+    turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
+    none = dict.fromkeys(("payload", "time", "temperature"))
+    return shlex.join(options_of(replace(units, position=position, **turned, **none)))
 
 
 def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, masses: Tensor | None) -> Predictions:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import RecordOptions
 from diffeo_calib.cli.record import record
@@ -11,6 +13,7 @@ from diffeo_calib.measurements.bags import read_bag, read_images
 from diffeo_calib.measurements.csv.images import IMAGE
 from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
+from diffeo_calib.measurements.table_format import TableFormat, options_of
 
 
 def run(given: RecordOptions) -> None:
@@ -24,8 +27,8 @@ def run(given: RecordOptions) -> None:
         say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
         if seen.values.shape[1] > len(PLACE) and TURN[0] not in table[0]:
             say(f"without rotations: those of {given.seen} never change, as of a device that measures none")
-        rotation = f" --rotation {','.join(TURN)} --convention quat_xyzw" * (TURN[0] in table[0])
-        say(f"fit {shown(output)} --position {','.join(PLACE)}{rotation} --length m --angle rad ...")
+        turned = {"rotation": [TURN], "convention": "quat_xyzw"} if TURN[0] in table[0] else {}
+        say(f"fit {shown(output)} {shlex.join(options_of(TableFormat('m', 'rad', position=PLACE, **turned)))} ...")
     else:
         offset = offset or 0.0
         found, without = pictured(joints, seen.times, limits, offset)

@@ -23,7 +23,7 @@ def run(wanted: ReportOptions) -> None:
     if tolerance is not None and data is not None and not bool(unseen(kinematics, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
-    given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
+    given = {"against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, wanted.output, data, **given, progress=progress)
     say(*provenance_lines(kinematics))

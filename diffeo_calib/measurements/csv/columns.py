@@ -19,7 +19,6 @@ from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,
     TableFormat,
-    by_frame,
     check_choice,
     column_names,
     flat_names,
@@ -99,13 +98,9 @@ class Columns:
     """The wanted columns of numbers: joints, positions, rotation, covariates, payload, deviations, readings.
 
     Args:
-        table: units, and the convention of the rotation.
-        joints: names or expressions of n joints, or the columns of a pose.
-        prismatic: (n,) which of them are prismatic.
-        triples: names of x, y and z of every marker.
-        rotation: names of the columns of the rotations, as many for each of the triples.
+        table: what it holds, and the units.
+        joints: names or expressions of n joints, or the columns of a pose. prismatic: (n,) which of them are prismatic.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
-        rotation_std: names of standard deviations of rotations: one, one per frame, or three per frame.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
         readings: what devices reported.
         all_hidden: whether rows may show no marker, because they hold something else.
@@ -114,59 +109,63 @@ class Columns:
     table: TableFormat
     joints: JointExpressions | PoseColumns
     prismatic: Tensor
-    triples: list[tuple[str, ...]]
-    rotation: tuple[str, ...] = ()
     std: tuple[str, ...] = ()
-    rotation_std: tuple[str, ...] = ()
     kinds_known: bool = True
     readings: tuple[Reported, ...] = ()
     all_hidden: bool = False
 
     @classmethod
-    def of(
-        cls,
-        table: TableFormat,
-        joints: Joints,
-        kinds: Sequence[str] | None,
-        triples: list[tuple[str, ...]],
-        readings: Sequence[Reported] = (),
-        *,
-        all_hidden: bool = False,
-    ) -> Columns:
+    def of(cls, table: TableFormat, readings: Sequence[Reported] = (), *, all_hidden: bool = False) -> Columns:
         """Check names and kinds of columns.
 
         Raises:
             MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
                 without kinds, other numbers of positions and rotations, or a column named twice.
         """
-        names, prismatic, kinds_known = _joint_columns(joints, kinds)
+        names, prismatic, kinds_known = _joint_columns(table.joints, table.kinds)
         if table.joint_length is not None and not kinds_known:
             what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
-        rotation, rotation_std = flat_names(table.rotation), flat_names(table.rotation_std)
-        _check_frames(table, len(triples))
-        std = _std_names(table.std, len(triples))
+        markers = len(table.triples)
+        _check_frames(table, markers)
         if table.payload is not None:
             column_names("payload", [table.payload], "the name of a column", (1,))
-        read = replace(joints, angle=table.angle) if isinstance(joints, PoseColumns) else JointExpressions.of(names)
-        own = table, read, prismatic, triples, rotation, std, rotation_std
-        columns = cls(*own, kinds_known, tuple(readings), all_hidden)
+        std = _std_names(table.std, markers)
+        given = table.joints
+        read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
+        columns = cls(table, read, prismatic, std, kinds_known, tuple(readings), all_hidden)
         twice = repeated(columns.names) or repeated(names)
         if twice:
-            plain = len(columns.names) == len(names) + 3 * len(triples)
-            what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
+            plain = len(columns.names) == len(names) + 3 * markers
+            what = "`joints`" + " and `position`" * bool(markers) if plain else "the named columns"
             fix = "name every column once"
-            fix += ", and one that holds the deviations of all axes alone" * bool({*twice} & {*std, *rotation_std})
+            deviations = {*twice} & {*std, *columns.rotation_std}
+            fix += ", and one that holds the deviations of all axes alone" * bool(deviations)
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
         return columns
 
     @property
+    def triples(self) -> list[tuple[str, ...]]:
+        """Names of x, y and z of every marker."""
+        return self.table.triples
+
+    @property
+    def rotation(self) -> tuple[str, ...]:
+        """Names of the columns of the rotations, as many for each of the triples."""
+        return flat_names(self.table.rotation)
+
+    @property
+    def rotation_std(self) -> tuple[str, ...]:
+        """Names of standard deviations of rotations: one, one per frame, or three per frame."""
+        return flat_names(self.table.rotation_std)
+
+    @property
     def groups(self) -> dict[Any, Group]:
         """All columns by what they hold, joints first; those of readings by themselves."""
-        table, positions = self.table, tuple(name for triple in self.triples for name in triple)
+        table = self.table
         found = {
             "q": Group(self.joints.columns),
-            "points": Group(positions, table.length),
+            "points": Group(flat_names(self.triples), table.length),
             "rotations": Group(self.rotation),
         }
         found |= {name: Group((column,)) for name, column in table.covariates.items()}
@@ -271,11 +270,6 @@ def _check_frames(table: TableFormat, positions: int) -> None:
             fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
             what, expected = f"`position` beside `{name}`", "one triple of columns for each"
             raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
-
-
-def position_triples(position: Names) -> list[tuple[str, ...]]:
-    """Return one (x, y, z) triple of column names per marker; MeasurementError without three names for each."""
-    return list(by_frame("position", position, "three names of columns for each marker", 3))
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

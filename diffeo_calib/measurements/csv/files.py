@@ -19,20 +19,26 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
-from diffeo_calib.measurements.csv.sensors import FileRows, ReadingColumns, SensorColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import (
+    FileRows,
+    ReadingColumns,
+    SensorColumns,
+    SocketColumns,
+    numeric_columns,
+    sensors_of,
+    text_columns,
+)
 from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import RowGroups
-from diffeo_calib.measurements.sockets import Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice
 from diffeo_calib.robots.se3 import transforms
 
 LOG = logging.getLogger(__name__)
@@ -41,12 +47,7 @@ Rows = TypeVar("Rows", bound=RowGroups)
 
 @outside_inference_mode
 def read_observations(
-    path: str | PathLike[str],
-    columns: TableColumns,
-    table: TableFormat,
-    *,
-    duplicates: str = "error",
-    growing: bool = False,
+    path: str | PathLike[str], table: TableFormat, *, duplicates: str = "error", growing: bool = False
 ) -> Any:
     """Read a table whose rows may be of several kinds; units and errors are those of :func:`read_measurements`.
 
@@ -54,9 +55,8 @@ def read_observations(
     two kinds is two observations, and so two rows with the same line number.
 
     Args:
-        path: the file. columns: its columns. table: units, separator and decimal mark, columns of rotations, deviations
-            and payloads. duplicates: "error", "keep" or "drop". growing: whether rows will be added, so that none may
-            be judged by the others.
+        path: the file. table: what it holds. duplicates: "error", "keep" or "drop". growing: whether rows will be
+            added, so that none may be judged by the others.
 
     Returns:
         :class:`Measurements` of positions, poses, sockets, or positions and sockets; :class:`Readings` of one kind;
@@ -64,8 +64,8 @@ def read_observations(
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
-    sensors, numbers = columns.sensors, columns.numeric(table)
-    with TableFile(file, numbers, columns.texts) as whole:
+    sensors, numbers = sensors_of(table), numeric_columns(table)
+    with TableFile(file, numbers, text_columns(table)) as whole:
         rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
     tables = []
     for sensor, here in _divided(rows, sensors):
@@ -77,9 +77,10 @@ def read_observations(
     data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
     sha256 = file_sha256(file)
     data = data.with_file_sha256(sha256)
-    if rows.alone and columns.position is not None:
-        marker = columns.marker and f"{columns.marker.partition('=')[0]}={','.join(data.marker_names)}"
-        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session, marker))
+    if rows.alone and table.position is not None:
+        marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
+        numbers = replace(numbers, table=replace(numbers.table, marker=marker))
+        data = data.with_origin(TableOrigin(file, numbers, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
@@ -126,28 +127,8 @@ def read_measurements(
     joints: Sequence[str] | None = None,
     length: str,
     angle: str,
-    sep: str = ",",
-    decimal: str = ".",
     duplicates: str = "error",
-    kinds: Sequence[str] | None = None,
-    rotation: Names | None = None,
-    convention: str | None = None,
-    rotation_angle: str | None = None,
-    lever: float = LEVER,
-    std: Names | None = None,
-    rotation_std: Names | None = None,
-    joint_length: str | None = None,
-    payload: str | None = None,
-    time: str | None = None,
-    temperature: str | None = None,
-    on: Sequence[str] | None = None,
-    camera_on_tool: bool = False,
-    session: str | None = None,
-    remounted: bool = False,
-    marker: str | None = None,
-    socket: Sequence[str] | str | None = None,
-    distances: Distances | None = None,
-    distance_std: float | None = None,
+    **columns: Any,
 ) -> Measurements:
     """Read a table of measurements from a CSV file and convert it to SI.
 
@@ -166,38 +147,11 @@ def read_measurements(
             both is two rows.
         length: unit of the positions in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
-        sep: one character between cells.
-        decimal: ``"."`` or ``","``.
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
-        kinds: kind of every joint; by default those of the robot, or all revolute.
-        rotation: names of the columns of the tool's rotation, for measured poses, or one such list for each frame on
-            several tips. ``position`` is then the triple of the frame's origin, or one for each. Rotation and position
-            map from the tool's frame to the measuring frame.
-        convention: how all rotations are written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
-            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
-        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
-        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
-        std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
-            per marker or three per marker.
-        rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
-            which are not the axes of Euler angles: one for all, or one or three for each frame.
-        joint_length: unit of the prismatic joints in the file, as ``length``; that of the positions by default.
-        payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
-            For another link see :meth:`Measurements.with_payload`.
-        time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
-        session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
-        remounted: whether the markers were mounted anew between these instead, see there.
-        marker: name of a column that names the marker of every line, where each has the position of one. Lines with the
-            same joint values that follow each other are one row. Markers are in the order in which they appear, or, for
-            rows of a model, in the one that ``"COLUMN=A,B,C"`` gives.
-        camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
-            deviations are along its axes; see :meth:`Measurements.from_poses`.
-        on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
-        socket: names of the columns that name the socket which held the ball, such as ``["place", "socket"]``; see
-            :meth:`Measurements.from_sockets`. The place is the first, or all but the last.
-        distances: known distances between sockets, in m, whatever the unit of length in the file.
-        distance_std: their standard deviation, m.
+        columns: all else that the table says, as fields of :class:`TableFormat` (``sep``, ``decimal``, ``rotation``,
+            ``convention``, ``rotation_angle``, ``std``, ``payload``, ``session``, ``marker``, ``on``, ...); and
+            ``socket``, ``distances`` and ``distance_std``, the fields of :class:`SocketColumns`.
 
     Returns:
         Measurements in rad and m, rows in the order of the file; of poses beside rows in sockets
@@ -210,31 +164,28 @@ def read_measurements(
     Warns:
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped; what was skipped.
     """
-    plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
-    table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
-    table = replace(table, camera_on_tool=camera_on_tool, remounted=remounted, time=time, temperature=temperature)
-    if socket is None and (distances is not None or distance_std is not None):
+    known = {name: columns.pop(name, None) for name in ("socket", "distances", "distance_std")}
+    sockets, socket, on = None, known.pop("socket"), columns.get("on")
+    if socket is not None:
+        tip = None if not on or isinstance(on, str) else on[-1]
+        sockets = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), **known, on=tip)
+    elif any(value is not None for value in known.values()):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
-    tip = None if not on or isinstance(on, str) else on[-1]
-    names = (socket,) if isinstance(socket, str) else tuple(socket or ())
-    sockets = None if socket is None else SocketColumns(names, distances, distance_std, tip)
-    columns = TableColumns(robot, position, sockets, session=session, kinds=kinds, on=on, marker=marker)
-    return _read(path, columns, table, duplicates, joints)
+    table = TableFormat(length, angle, **columns, joints=robot, position=position, sockets=sockets)
+    return _read(path, table, duplicates, joints)
 
 
-def _read(
-    path: str | PathLike[str], columns: TableColumns, table: TableFormat, duplicates: str, joints: Sequence[str] | None
-) -> Any:
-    """Read columns, whose joints may have other names in the file than in the robot."""
-    robot = columns.joints
+def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints: Sequence[str] | None) -> Any:
+    """Read a table, whose joints may have other names in the file than in the robot."""
+    robot = table.joints
     if joints is None:
-        return read_observations(path, columns, table, duplicates=duplicates)
+        return read_observations(path, table, duplicates=duplicates)
     names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
     if len(names) != len(joints):
         got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
         raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
-    columns = replace(columns, joints=joints, kinds=columns.kinds or kinds)
-    return read_observations(path, columns, table, duplicates=duplicates).with_joint_names(names)
+    table = replace(table, joints=joints, kinds=table.kinds or kinds)
+    return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
 
 
 @outside_inference_mode
@@ -245,57 +196,24 @@ def read_readings(
     kind: str = "distance",
     *,
     joints: Sequence[str] | None = None,
-    length: str,
-    angle: str,
-    sep: str = ",",
-    decimal: str = ".",
     duplicates: str = "error",
-    kinds: Sequence[str] | None = None,
-    joint_length: str | None = None,
-    std: Sequence[str] | str | None = None,
-    payload: str | None = None,
-    session: str | None = None,
-    on: str | None = None,
-    offset_std: float = 0.0,
-    intrinsics: tuple[float, float, float, float] | None = None,
+    **columns: Any,
 ) -> Readings:
     """Read a table of distances, heights or places in images from a CSV file, in SI.
 
     Args:
-        path, robot, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.
+        path, robot, joints, duplicates: as in :func:`read_measurements`.
         values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
         kind: "distance", "height" or "image".
-        length: unit of the readings in the file, as in :func:`read_measurements`; images are in pixels.
-        angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
-        std: name of a column with standard deviations of the readings in their unit, or of two for images.
-        session: name of the column that names the device of each row: fixed point, plane or camera. One by default.
-        on: name of the tip that carries the ball, for a robot with several tips.
-        offset_std: standard deviation of the unknown zero of distances, in m, whatever the unit of length in the file.
-        intrinsics: fx, fy, cx, cy of the camera, pixels.
+        columns: fields of :class:`ReadingColumns` (``std``, ``offset_std``, ``intrinsics``, ``on``, ``session``, the
+            column of the devices) and of :class:`TableFormat` (``length``, ``angle``, ``payload``, ...).
 
-    Raises:
-        MeasurementError: anything unreadable, missing, not finite or repeated (file, line and column are named); an
-            unknown kind, or a number of columns that does not match it.
-
-    Warns:
-        DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
+    Raises, warns: as :func:`read_measurements`; an unknown kind, or a number of columns that does not match it.
     """
     check_choice("kind", kind, ("distance", "height", "image"))
-    constant = isinstance(values, (int, float)) and not isinstance(values, bool)
-    count, several = 2 if kind == "image" else 1, (1, 2) if kind == "image" else (1,)
-    if constant and kind != "image":
-        names: tuple[str, ...] | float = float(values)  # pyright: ignore[reportArgumentType]
-    else:
-        given = [values] if isinstance(values, str) else values
-        names = column_names("values", given, f"{count} names of columns for {kind!r}", (count,))
-    if (intrinsics is None) != (kind != "image"):
-        fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
-        raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
-    given = [std] if isinstance(std, str) else std
-    known = () if given is None else column_names("std", given, "names of columns", several)
-    of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or (1.0, 1.0, 0.0, 0.0), known, on)
-    table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
-    return _read(path, TableColumns(robot, readings=(of_kind,), kinds=kinds), table, duplicates, joints)
+    given = {name: columns.pop(name) for name in ("std", "offset_std", "intrinsics", "on") if name in columns}
+    own = ReadingColumns.checked(kind, values, device=columns.pop("session", None), **given)
+    return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 
 def read_joints(
@@ -313,19 +231,19 @@ def read_joints(
     Returns:
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
-    with open_joints(path, joints, table, kinds=kinds) as file:
-        return file.read()[0]["q"]
+    return read_configurations(path, joints, table, kinds=kinds)["q"]
 
 
-def open_joints(
+def read_configurations(
     path: str | PathLike[str],
     joints: Joints,
     table: TableFormat,
     *,
     kinds: Sequence[str] | None = None,
-) -> TableFile:
-    """The same file as :func:`read_joints` reads, to be read in blocks."""
-    return TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
+) -> Values:
+    """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
+    with TableFile(Path(path), Columns.of(table.joints_only(joints, kinds))) as file:
+        return file.read()[0]
 
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:

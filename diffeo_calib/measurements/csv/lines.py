@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import os
 import re
 import shutil
 import tempfile
@@ -97,12 +96,6 @@ class CsvLines:
 
     def __exit__(self, kind: type[BaseException] | None, _value: object, _trace: TracebackType | None) -> None:
         self._stack.close()
-
-    @property
-    def progress(self) -> float:
-        """Fraction of the file that has been read."""
-        size = os.fstat(self._file.fileno()).st_size
-        return min(self._file.buffer.tell() / size, 1.0) if size else 0.0
 
     @property
     def notes(self) -> list[str]:

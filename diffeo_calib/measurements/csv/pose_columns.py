@@ -53,6 +53,11 @@ class PoseColumns:
         return cls(columns, convention.strip())
 
     @property
+    def text(self) -> str:
+        """What :meth:`of` parses."""
+        return ",".join(self.columns) + f"={self.convention}" * bool(self.convention)
+
+    @property
     def texts(self) -> tuple[str, ...]:
         """Names of the joints; of the columns without a machine."""
         return self.columns if self.robot is None else self.robot.joint_names

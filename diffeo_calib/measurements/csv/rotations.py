@@ -88,7 +88,7 @@ def numeric_table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tens
 
     None too where a row is made of several lines.
     """
-    if not isinstance(data.origin, TableOrigin) or data.origin.marker is not None:
+    if not isinstance(data.origin, TableOrigin) or data.origin.columns.table.marker is not None:
         return None, {}
     table = data.origin.numeric_columns(data.line_numbers)
     return (data.origin.columns, table) if table else (None, {})

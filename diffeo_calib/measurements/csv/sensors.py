@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import (
@@ -21,7 +21,6 @@ from diffeo_calib.measurements.csv.columns import (
     Group,
     Reported,
     Values,
-    position_triples,
 )
 from diffeo_calib.measurements.pose_frames import (
     inverse_poses,
@@ -33,7 +32,7 @@ from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import Names, TableFormat
+from diffeo_calib.measurements.table_format import TableFormat, column_names
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
@@ -116,23 +115,15 @@ class SensorColumns:
 
 @dataclass(frozen=True)
 class PositionColumns(SensorColumns):
-    """Measured positions or poses, whose columns are those of a table's :class:`Columns`.
+    """Measured positions or poses, whose columns a table's :class:`TableFormat` names."""
 
-    Args:
-        session: column that names the set-up of every row; None for one. on: tips of the markers or frames.
-        marker: column that names the marker of every line, "=" and the names in order where a model has them; None if
-            every line has the positions of all.
-    """
-
-    session: str | None = None
-    on: Sequence[str] | None = None
-    marker: str | None = None
+    form: TableFormat
     word = "a position"
 
     @property
     def texts(self) -> Mapping[str, bool]:
         """See :class:`SensorColumns`."""
-        own = self.session, self.marker and self.marker.partition("=")[0]
+        own = self.form.session, self.form.marker and self.form.marker.partition("=")[0]
         return {name: True for name in own if name is not None}
 
     def filled(self, rows: FileRows) -> Tensor:
@@ -162,22 +153,23 @@ class PositionColumns(SensorColumns):
                 camera_on_tool=table.camera_on_tool,
                 doubt=False,
             )
-        return data.with_tips(self.on).with_sessions(rows.devices(self.session, "a name"), remounted=table.remounted)
+        set_ups = rows.devices(self.form.session, "a name")
+        return data.with_tips(self.form.on).with_sessions(set_ups, remounted=table.remounted)
 
     def _with_markers(self, rows: FileRows) -> tuple[FileRows, Sequence[str] | None]:
         """The rows, with (N, P, 3) of all markers, NaN where hidden, if a column names that of every line; these names.
 
         A row holds lines that follow each other with the same joint values, payload and session, of different markers.
         """
-        if self.marker is None:
+        if self.form.marker is None:
             return rows, None
-        column, _, given = self.marker.partition("=")
+        column, _, given = self.form.marker.partition("=")
         texts, values = rows.named(column, "the name of a marker"), rows.values
         names = given.split(",") if given else list(dict.fromkeys(texts))
         if unknown := [name for name in dict.fromkeys(texts) if name not in names]:
             what, fix = f"file '{rows.path}', column '{column}'", "remove their lines, or calibrate with all of them"
             raise MeasurementError.of(what, expected=f"markers of the model: {few(names)}", got=few(unknown), fix=fix)
-        sessions = [""] * len(texts) if self.session is None else rows.texts[self.session]
+        sessions = [""] * len(texts) if self.form.session is None else rows.texts[self.form.session]
         loads = values.get("payload", torch.zeros(len(texts), dtype=torch.float64, device=HOST))
         poses = list(zip(values["q"].tolist(), loads.tolist(), sessions, strict=True))
         numbers, first = list[int](), list[int]()
@@ -200,7 +192,7 @@ class PositionColumns(SensorColumns):
         if frames is not None:
             numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
             values |= {"rotations": numbers, "rotation_std": part.rotation_std}
-        texts = {} if self.session is None else {self.session: part.device_names}
+        texts = {} if self.form.session is None else {self.form.session: part.device_names}
         return values, texts, *part.index
 
 
@@ -287,6 +279,28 @@ class ReadingColumns(SensorColumns):
     on: str | None = None
     unit: tuple[str, float] = MILLIMETRES
 
+    @classmethod
+    def checked(
+        cls,
+        kind: str,
+        values: Any,
+        *,
+        std: Sequence[str] | str | None = None,
+        intrinsics: tuple[float, float, float, float] | None = None,
+        **others: Any,
+    ) -> ReadingColumns:
+        """The columns by names in any form; MeasurementError for a number of them that does not match the kind."""
+        count = 2 if kind == "image" else 1
+        if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
+            given = [values] if isinstance(values, str) else values
+            values = column_names("values", given, f"{count} names of columns for {kind!r}", (count,))
+        if (intrinsics is None) != (kind != "image"):
+            fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
+            raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
+        given = [std] if isinstance(std, str) else std
+        known = () if given is None else column_names("std", given, "names of columns", (1, count))
+        return cls(kind, values, intrinsics=intrinsics or (1.0, 1.0, 0.0, 0.0), std=known, **others)
+
     @property
     def word(self) -> str:
         """See :class:`SensorColumns`."""
@@ -342,71 +356,43 @@ class ReadingColumns(SensorColumns):
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
-@dataclass(frozen=True)
-class TableColumns:
-    """The columns of a table, of whatever kinds its rows are. Units are those of a :class:`TableFormat`.
+def sensors_of(table: TableFormat) -> list[SensorColumns]:
+    """The columns of each kind of rows of a table."""
+    positions = [] if table.position is None else [PositionColumns(table)]
+    return [*positions, *([] if table.sockets is None else [table.sockets]), *table.readings]
 
-    Args:
-        joints: names of the joint columns in the robot's order, or the robot.
-        position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
-        sockets: those of a ball in sockets. readings: those of each kind of reading, and of images (csv/images.py).
-        session: column that names the set-up of the device that measures positions or poses.
-        kinds: kind of every joint; by default those of the robot, or all revolute.
-        on: names of the tips that carry the markers or frames, for a robot with several tips.
-        marker: column that names the marker of every line, as of :class:`PositionColumns`.
+
+def text_columns(table: TableFormat) -> dict[str, bool]:
+    """The columns of texts, and whether a table must have them."""
+    pairs = [pair for sensor in sensors_of(table) for pair in sensor.texts.items()]
+    return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
+
+
+def numeric_columns(table: TableFormat) -> Columns:
+    """The columns of numbers.
+
+    Raises:
+        MeasurementError: no kind of rows, or options for something that is not measured.
     """
+    sensors = sensors_of(table)
+    _check_options(table, several=len(sensors) != 1)
+    table = table if table.position is None else table.for_reading()
+    reported = [one for sensor in sensors for one in sensor.reported(table)]
+    return Columns.of(table, reported, all_hidden=len(sensors) > 1)
 
-    joints: Any
-    position: Names | None = None
-    sockets: SocketColumns | None = None
-    readings: tuple[Any, ...] = ()
-    session: str | None = None
-    kinds: Sequence[str] | None = None
-    on: Sequence[str] | None = None
-    marker: str | None = None
 
-    @property
-    def sensors(self) -> list[SensorColumns]:
-        """The columns of each kind."""
-        positions = [] if self.position is None else [PositionColumns(self.session, self.on, self.marker)]
-        return [*positions, *([] if self.sockets is None else [self.sockets]), *self.readings]
-
-    @property
-    def texts(self) -> dict[str, bool]:
-        """The columns of texts, and whether a table must have them."""
-        pairs = [pair for sensor in self.sensors for pair in sensor.texts.items()]
-        return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
-
-    def numeric(self, table: TableFormat) -> Columns:
-        """The columns of numbers.
-
-        Raises:
-            MeasurementError: no kind of rows, or options for something that is not measured.
-        """
-        self._check_options(table)
-        triples = [] if self.position is None else position_triples(self.position)
-        table = table.joints_only() if self.position is None else table.for_reading()
-        reported = [one for sensor in self.sensors for one in sensor.reported(table)]
-        several = len(self.sensors) > 1
-        return Columns.of(table, self.joints, self.kinds, triples, reported, all_hidden=several)
-
-    def _check_options(self, table: TableFormat) -> None:
-        if not self.sensors:
-            fix = "name the columns of the marker, or those of `socket`"
-            raise MeasurementError.of("`position` is missing", fix=fix)
-        if table.remounted and self.session is None:
-            raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
-        several = len(self.sensors) > 1 or self.position is None or len(position_triples(self.position)) > 1
-        if self.marker is not None and (several or table.rotation is not None):
-            expected = "one position (x, y, z) in every line, and neither rotations, sockets nor readings"
-            raise MeasurementError.of(f"`marker` ({shown(self.marker)})", expected=expected, fix="leave it out")
-        if self.position is not None:
-            return
-        given = {"rotation": table.rotation, "rotation_std": table.rotation_std, "std": table.std}
-        given |= {"camera_on_tool": table.camera_on_tool or None, "remounted": table.remounted or None}
-        given |= {"session": self.session}
-        names = [f"`{name}`" for name, value in given.items() if value is not None]
-        if names:
-            beside = "socket" if self.sockets is not None else "readings"
-            fix = "leave it out: no position was measured; sockets of another set-up are other places"
-            raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)
+def _check_options(table: TableFormat, *, several: bool) -> None:
+    if not sensors_of(table):
+        fix = "name the columns of the marker, or those of `socket`"
+        raise MeasurementError.of("`position` is missing", fix=fix)
+    if table.remounted and table.session is None:
+        raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
+    if table.marker is not None and (several or len(table.triples) != 1 or table.rotation is not None):
+        expected = "one position (x, y, z) in every line, and neither rotations, sockets nor readings"
+        raise MeasurementError.of(f"`marker` ({shown(table.marker)})", expected=expected, fix="leave it out")
+    options = "rotation", "rotation_std", "std", "camera_on_tool", "remounted", "session"
+    names = [f"`{name}`" for name in options if getattr(table, name) not in (None, False)]
+    if table.position is None and names:
+        beside = "socket" if table.sockets is not None else "readings"
+        fix = "leave it out: no position was measured; sockets of another set-up are other places"
+        raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)

@@ -1,11 +1,11 @@
-"""Tables of joint values and measurements, read in blocks of rows after all rows have been checked."""
+"""Tables of joint values and measurements, all of whose rows are checked together."""
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,9 @@ from diffeo_calib.measurements.csv.cells import (
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
-from diffeo_calib.measurements.poses import ANGLE_UNITS, LEVER
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.poses import ANGLE_UNITS
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, options_of
 
 
 @dataclass(frozen=True)
@@ -38,33 +39,19 @@ class TableOrigin:
         path: the file.
         columns: which of its columns were read, and how.
         sha256: of its content; None for what can be read only once, such as a pipe.
-        session: column of the set-ups. marker: column that names the marker of each line, "=" and the names in order.
     """
 
     path: Path
     columns: Columns
     sha256: str | None
-    session: str | None = None
-    marker: str | None = None
 
     @property
     def options(self) -> str:
         """The options with which the command line reads this table, as a shell would take them."""
-        columns, table = self.columns, self.columns.table
-        frames = max(len(columns.triples), 1)
-        words = [word for triple in columns.triples for word in ("--position", ",".join(triple))]
-        for option, names in (("--rotation", columns.rotation), ("--rotation-std", columns.rotation_std)):
-            each = len(names) // frames or len(names)
-            own = [names[k : k + each] for k in range(0, len(names), each or 1)]
-            words += [word for group in own for word in (option, ",".join(group))]
-        lever = f"{table.lever * table.per_metre:.17g}" if columns.rotation and table.lever != LEVER else None
-        one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
-        one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
-        one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints.texts)}
-        one |= {**table.covariates, "session": self.session, "marker": self.marker}
-        one |= {"sep": table.sep, "decimal": table.decimal}
-        words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
-        return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
+        joints, table = self.columns.joints, self.columns.table
+        if isinstance(joints, PoseColumns):
+            return shlex.join(["--robot-pose", joints.text, *options_of(replace(table, joints=()))])
+        return shlex.join(options_of(replace(table, joints=joints.texts)))
 
     def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.
@@ -99,29 +86,20 @@ MUCH_FARTHER = 3.0
 ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 
-Progress = Callable[[float], object]
-"""Called with the fraction of the file that has been read."""
-
 
 class TableFile(CsvLines):
     """A CSV file with columns in known units, used as a context.
-
-    It can be read as a whole (:meth:`read`), or in two passes for joint values that do not fit in memory: :meth:`check`
-    finds all mistakes and the number of rows; then :meth:`laden_joints` returns the rows.
 
     Args:
         path: the file.
         columns: which columns of numbers it has, and their units. texts: columns of texts, "nan" being empty, and
             whether it must have them.
-
-    Attributes:
-        rows: number of rows; 0 before the first pass.
     """
 
     def __init__(self, path: Path, columns: Columns, texts: Mapping[str, bool] = {}) -> None:  # not changed
         needed = [name for name, needed in texts.items() if needed]
         super().__init__(path, columns.table.sep, [*columns.names, *needed])
-        self.columns, self.texts, self.rows = columns, texts, 0
+        self.columns, self.texts = columns, texts
         self._words: dict[str, list[int]] = {}
 
     def read(self, *, zeros: bool = True) -> tuple[Values, dict[str, list[str]], list[int]]:
@@ -173,25 +151,6 @@ class TableFile(CsvLines):
             at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
             names = few([self.columns.names[k] for k in own.values[:3]])
             warn_user(f"file '{self.path}': {names} are 0, 0, 0 in line {at}, far from other rows: taken as not seen")
-
-    def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
-        """Find all mistakes, count the rows, and show blocks to ``each``; errors and warnings as in :meth:`read`."""
-        for block in self._checked():
-            if each is not None:
-                each(self.columns.to_si(block.numbers))
-            if progress is not None:
-                progress(self.progress)
-
-    def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """Joint values (B, n) [rad or m] of every block, and payloads (B,) if there are some, after :meth:`check`."""
-        count = 0
-        for block in self._numbers():
-            count += len(block.lines)
-            values = self.columns.to_si(block.numbers)
-            yield values["q"], values.get("payload")
-        if count != self.rows:
-            what, fix = f"file '{self.path}' changed while it was read", "run the command again"
-            raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
 
     def _numbers(self) -> Iterator[Block]:
         """Numbers as written in the file, in blocks; MeasurementError for the first block with a mistake."""
@@ -265,7 +224,7 @@ class TableFile(CsvLines):
         """All blocks; what they have in common is checked after the last one."""
         columns, largest = self.columns, None
         checks = [group.check for group in columns.groups.values() for _ in group.names]
-        unseen, self.rows = columns.hideable, 0
+        unseen, count = columns.hideable, 0
         for block in self._numbers():
             raw = block.numbers
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
@@ -276,7 +235,7 @@ class TableFile(CsvLines):
                     bad = [(block.lines[row], name, f"{float(values[row]):g}") for row in wrong]
                     raise bad_cells(self.path, bad, check.expected, check.fix)
             unseen = [own for own in unseen if bool(raw[:, own.values].isnan().all())]
-            self.rows += len(block.lines)
+            count += len(block.lines)
             yield block
         notes = self.notes
         if self._words:
@@ -290,5 +249,5 @@ class TableFile(CsvLines):
                 warn_user(f"file '{self.path}': {text}")
         for own in unseen:
             names = few([columns.names[place] for place in own.values])
-            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave them out"
+            what, fix = f"file '{self.path}', columns {names}: empty in all {count} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)

@@ -16,16 +16,23 @@ from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, listed
-from diffeo_calib.common.files import WholeFile, write_whole
+from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Group, check_count, position_triples
+from diffeo_calib.measurements.csv.columns import check_count
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SensorColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import (
+    ReadingColumns,
+    SensorColumns,
+    SocketColumns,
+    numeric_columns,
+    sensors_of,
+    text_columns,
+)
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers
 from diffeo_calib.measurements.readings import ONE_DEVICE
-from diffeo_calib.measurements.table_format import Names, TableFormat, flat_names
+from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 Cells = Sequence[Sequence[float | str]]
 """Rows of cells: numbers and texts."""
@@ -38,11 +45,10 @@ def write_predictions(
     blocks: Iterable[Predictions],
     table: TableFormat,
     *,
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
     prefixes: Sequence[str] = ("",),
     more: Sequence[str] = (),
     poses: bool = False,
+    **columns: Any,
 ) -> None:
     """Write configurations, predicted markers or poses and their standard deviations; overwrites.
 
@@ -55,45 +61,36 @@ def write_predictions(
             deviations (B, P, 3), m, or (B, 6) or (B, T, 6): of positions, m, and of rotations about the measuring
             frame's axes, rad; and more cells (B, k) as they are written.
         table: the format, of poses with defaults as in :func:`write_measurements`.
-        joints: names of the joint columns.
-        kinds: kind of every joint; all revolute by default.
         prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
-        poses: whether the blocks hold poses.
+        poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
 
     Raises:
         MeasurementError: unknown unit or convention.
         InputError: a file that cannot be written.
     """
-    columns, count = Columns.of(table.joints_only(), joints, kinds, []), len(prefixes)
-    names, turned = list(columns.joints.columns), [()] * count
-    if poses:
-        table = table.for_writing(rotation_std=True, prefixes=prefixes)
-        turns, deviations = (flat_names(own) for own in (table.rotation, table.rotation_std))
-        each = len(turns) // count
-        turned = [turns[each * k : each * (k + 1)] + deviations[3 * k : 3 * (k + 1)] for k in range(count)]
-    for prefix, own in zip(prefixes, turned, strict=True):
-        names += [*(f"{prefix}{std}{axis}" for std in ("", "std_") for axis in "xyz"), *own]
+    table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
+    table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
+    numeric = numeric_columns(table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table)
+    table, names = numeric.table, [*numeric.joints.columns]
+    turned = zip(table.rotation or (), table.rotation_std or (), strict=True) if poses else [((), ())] * len(prefixes)
+    for k, (triple, (turns, deviations)) in enumerate(zip(numeric.triples, turned, strict=True)):
+        names += [*triple, *numeric.std[3 * k : 3 * k + 3], *turns, *deviations]
 
-    def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Tensor:
-        frames = by_frame(mean) if poses else None
-        places = mean if frames is None else frames[..., :3, 3]
-        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), count, -1)
-        for k in range(count):
-            parts.append(Group((), table.length).from_si(torch.cat([places[:, k], spreads[:, k, :3]], dim=1)))
-            if frames is not None and table.convention is not None and table.rotation_angle is not None:
-                turns = visible_rotation_numbers(frames[:, k : k + 1], table.convention, table.rotation_angle)
-                parts += [turns.flatten(1).cpu(), Group((), table.rotation_angle).from_si(spreads[:, k, 3:])]
-        return torch.cat([*parts, *others], dim=1)
+    def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
+        frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
+        values = {"q": q, "points": mean if frames is None else frames[..., :3, 3], "std": spreads[..., :3]}
+        if frames is not None:
+            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
+            values |= {"rotations": numbers, "rotation_std": spreads[..., 3:]}
+        cells = numeric.from_si(values)
+        beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
+        lines = zip(*(cells[name] for name in names), strict=True)
+        return [[*line, *own] for line, own in zip(lines, beside, strict=True)]
 
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
 
-def write_rows(
-    path: str | PathLike[str],
-    names: Sequence[str],
-    blocks: Iterable[Tensor | Cells],
-    table: TableFormat,
-) -> None:
+def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:
     """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
 
     Texts are written as they are, NaN becomes an empty cell.
@@ -101,8 +98,7 @@ def write_rows(
     with WholeFile(path) as file:
         file.write(csv_text([names], table.sep))
         for block in blocks:
-            rows = block.tolist() if isinstance(block, Tensor) else block
-            file.write(csv_text(([_cell(value, table) for value in row] for row in rows), table.sep))
+            file.write(csv_text(([_cell(value, table) for value in row] for row in block), table.sep))
 
 
 def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
@@ -145,28 +141,19 @@ class Program:
             what = f"the program already has the column(s) {listed(taken)}, which the output adds"
             raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
 
-    def write(self, path: Path, q: Tensor, joints: Columns, added: Mapping[str, Column], table: TableFormat) -> None:
-        """Write the program with other joint values and more columns; overwrites.
+    def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
+        """Write the program with other and more columns; overwrites.
 
         Args:
-            path: the file.
-            q: (N, n) joint values, rad and m; NaN becomes an empty cell.
-            joints: their columns.
-            added: names and values of the columns to add, numbers in the units of the file.
-            table: units, separator and decimal mark.
+            path: the file. cells: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
+            table: separator and decimal mark.
 
         Raises:
             InputError: a file that cannot be written.
         """
-        values = joints.joints_from_si(q).tolist()
-        places = [self.header.index(name) for name in joints.joints.columns]
-        lines = [[*self.header, *added]]
-        for row, cells in enumerate(self.rows):
-            line = list(cells)
-            for place, value in zip(places, values[row], strict=True):
-                line[place] = _cell(value, table)
-            lines.append([*line, *(_cell(column[row], table) for column in added.values())])
-        write_whole(path, csv_text(lines, table.sep))
+        added = {name: own for name, own in cells.items() if name not in self.header}
+        kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
+        write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
 
 
 def _cell(value: str | float, table: TableFormat) -> str:
@@ -180,16 +167,7 @@ SOCKET, SESSION, PAYLOAD = "socket", "session", "payload"
 
 
 @outside_inference_mode
-def write_measurements(
-    path: str | PathLike[str],
-    data: Any,
-    table: TableFormat,
-    *,
-    joints: Sequence[str] | ChainLike | None = None,
-    position: Names | None = None,
-    kinds: Sequence[str] | None = None,
-    session: str | None = None,
-) -> tuple[TableColumns, TableFormat]:
+def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat, **columns: Any) -> TableFormat:
     """Write a CSV file that :func:`read_measurements` or :func:`read_observations` reads back; overwrites.
 
     In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
@@ -204,89 +182,92 @@ def write_measurements(
             ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
             several tips; for standard deviations std_x, ... for a position column x, ..., and std_rx, std_ry, std_rz
             for the rotation; payload for masses, time and temperature. ``std`` has three names per marker.
-        joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
-        position: x, y, z columns of every marker or frame; default x, y, z for one, else ``NAME_x``, ... with the names
-            of the frames' tips, ``data.marker_names`` or marker1, marker2, ...
-        kinds: kind of every joint; by default those of the robot, or all revolute.
-        session: name of the column of set-ups and devices, "session" by default.
+        columns: further fields of the format. Defaults: ``data.joint_names`` or q1, q2, ...; for positions x, y, z for
+            one marker or frame, else ``NAME_x``, ... with the names of the frames' tips, ``data.marker_names`` or
+            marker1, marker2, ...; "session" for set-ups and devices.
 
     Returns:
-        what :func:`read_observations` needs to read the file. Sockets are in the column ``socket``, readings in
-        distance, displacement, height, or u and v, with a number after it for a second table of the same kind. Known
-        distances between sockets are not in the file, but in these columns.
+        the format of the file. Sockets are in the column ``socket``, readings in distance, displacement, height, or u
+        and v, with a number after it for a second table of the same kind. Known distances between sockets are not in
+        the file, but in this format.
 
     Raises:
         MeasurementError: unknown unit, a number of names that does not match, names for something that the table
             does not hold, or both positions and poses.
         InputError: a file that cannot be written.
     """
-    whole = Observations.joined([data])
-    names = joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
-    columns, table = _sheet(whole, table, position, session)
-    columns = replace(columns, joints=names, kinds=kinds)
-    numeric = columns.numeric(table)
+    whole, table = Observations.joined([data]), replace(table, **columns)
+    names = table.joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
+    table = replace(_sheet(whole, table), joints=names)
+    numeric = numeric_columns(table)
     check_count("joint columns", numeric.joints.texts, whole.n, "joint")
-    sockets = () if columns.sockets is None else columns.sockets.names
-    images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in columns.readings)
-    sessions = {columns.session, *(one.device for one in columns.readings)} - {None}
+    sockets = () if table.sockets is None else table.sockets.names
+    images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in table.readings)
+    sessions = {table.session, *(one.device for one in table.readings)} - {None}
     twice = repeated([*numeric.names, *sockets, *images, *sessions])
     if twice:
         what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(twice)} twice"
         raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
     found: list[tuple[int, dict[str, float | str]]] = []
-    for part, rows, sensor in zip(whole.parts, whole.index, _sensors(whole, columns), strict=True):
+    for part, rows, sensor in zip(whole.parts, whole.index, _sensors(whole, table), strict=True):
         values, texts, lines = sensor.written(part, table)
         known = {"q": part.q, "payload": part.payload, **part.drifting}
         of_lines = {name: own if own is None else own[lines.to(own.device)] for name, own in known.items()}
-        cells = numeric.from_si({**of_lines, **values}) | texts
+        cells = {**numeric.from_si({**of_lines, **values}), **texts}
         each = [dict(zip(cells, line, strict=True)) for line in zip(*cells.values(), strict=True)]
         found += zip(rows[lines].tolist(), each, strict=True)
     there = {name for _, cells in found for name in cells}
-    header = [name for name in (*numeric.names, *columns.texts) if name in there]
+    if empty := [name for name in numeric.names if name not in there]:
+        what, got = f"the column(s) {listed(empty)}", "measurements without these values"
+        raise MeasurementError.of(what, got=got, fix="leave the names out")
+    header = [name for name in (*numeric.names, *text_columns(table)) if name in there]
     in_order = sorted(found, key=lambda line: line[0])
     write_rows(path, header, [[[cells.get(name, "") for name in header] for _, cells in in_order]], table)
-    return columns, table
+    return table
 
 
-def _sheet(
-    whole: Observations, table: TableFormat, position: Names | None, session: str | None
-) -> tuple[TableColumns, TableFormat]:
-    """The columns, joints not named yet, and their format; by default those of :func:`write_measurements`."""
+def _sheet(whole: Observations, table: TableFormat) -> TableFormat:
+    """The columns, by default those of :func:`write_measurements`; joints are not named yet."""
     measured = [part for part in whole.parts if part.kind in ("position", "pose")]
     if len(measured) > 1:
         fix = "write them to two files"
         raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
-    device, triples = measured[0] if measured else None, None
-    _check_held(device, whole, table, position)
+    device, names = measured[0] if measured else None, set(whole.device_names) - {""}
+    board = None if device is None else device.board
+    if table.camera_on_tool != (board is not None):
+        got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
+        fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
+        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
+    if table.session is not None and not names:
+        raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
     if device is not None and device.corners is not None:
         device, table = None, replace(table, camera_on_tool=False)
+    if table.position is not None and device is None:
+        raise MeasurementError.of("`position`", got="a table without positions", fix="leave it out")
+    session = (table.session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
     if device is not None:
-        triples = position_triples(position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes])
-        table = replace(_with_names(device, table, triples), remounted=device.remounted)
+        position = table.position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes]
+        on = device.on and list(device.bodies.tips(device.on))
+        table = _with_names(device, replace(table, position=position, remounted=device.remounted, on=on))
     if whole.payload is not None and table.payload is None:
         table = replace(table, payload=PAYLOAD)
-    table = replace(table, **{name: getattr(table, name) or name for name in whole.covariate_names})
-    names = set(whole.device_names) - {""}
-    if session is not None and not names:
-        raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
-    session = (session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
+    covariates = {name: getattr(table, name) or name for name in whole.covariate_names}
     own = session if device is not None and device.session is not None else None
-    on = device and device.on and list(device.bodies.tips(device.on))
-    columns = TableColumns((), triples, _socket_columns(whole), _reading_columns(whole, session), own, on=on)
-    return columns, table
+    readings = _reading_columns(whole, session)
+    return replace(table, **covariates, sockets=_socket_columns(whole), readings=readings, session=own)
 
 
-def _sensors(whole: Observations, columns: TableColumns) -> list[SensorColumns]:
+def _sensors(whole: Observations, table: TableFormat) -> list[SensorColumns]:
     """The columns of each part."""
-    readings, (first, *_) = iter(columns.readings), columns.sensors
+    readings, (first, *_) = iter(table.readings), sensors_of(table)
     positions = [part.kind in ("position", "pose") and part.corners is None for part in whole.parts]
     kinds = zip(whole.parts, positions, strict=True)
-    return [first if own else columns.sockets if part.kind == "socket" else next(readings) for part, own in kinds]
+    return [first if own else table.sockets if part.kind == "socket" else next(readings) for part, own in kinds]
 
 
-def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -> TableFormat:
+def _with_names(data: Any, table: TableFormat) -> TableFormat:
     """The format with the columns of rotations and deviations."""
-    bodies = data.seen_bodies.shape[1]
+    bodies, triples = data.seen_bodies.shape[1], table.triples
     check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
     if data.poses is not None:
         table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.prefixes)
@@ -321,23 +302,3 @@ def _reading_columns(whole: Observations, session: str | None) -> tuple[Any, ...
             given = part.kind, names, session, part.offset_std, part.intrinsics
             found.append(ReadingColumns(*given, std=std, on=part.on, unit=part.unit))
     return tuple(found)
-
-
-def _check_held(device: Any, whole: Observations, table: TableFormat, position: Names | None) -> None:
-    """Refuse names for columns that the table cannot fill."""
-    poses, std, turns, board = (getattr(device, name, None) for name in ("poses", "std", "rotation_std", "board"))
-    held = {"rotation": poses, "convention": poses, "rotation_angle": poses}
-    deviations, payload = {"std": std, "rotation_std": turns}, {"payload": whole.payload}
-    drifting = {name: name in whole.covariate_names or None for name in table.covariates}
-    groups = (held, "poses"), (deviations, "standard deviations"), (payload, "payloads"), (drifting, "such a column")
-    for group, what in groups:
-        empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
-        if empty:
-            names = " and ".join(f"`{name}`" for name in empty)
-            raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
-    if position is not None and device is None:
-        raise MeasurementError.of("`position`", got="a table without positions", fix="leave it out")
-    if table.camera_on_tool != (board is not None):
-        got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
-        fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
-        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)

@@ -11,11 +11,10 @@ from diffeo_calib.common.lazy import lazy_names
 
 if TYPE_CHECKING:
     from diffeo_calib.reports.plots.errors import stages, workspace
-    from diffeo_calib.reports.plots.joints import comparison, expected_error, explained, transmissions
+    from diffeo_calib.reports.plots.joints import expected_error, explained, transmissions
     from diffeo_calib.reports.plots.trust import learning_curve, residuals, uncertainty
 
 __all__ = [
-    "comparison",
     "expected_error",
     "explained",
     "learning_curve",
@@ -29,7 +28,7 @@ __all__ = [
 if not TYPE_CHECKING:
     modules = {
         "errors": "stages workspace",
-        "joints": "comparison expected_error explained transmissions",
+        "joints": "expected_error explained transmissions",
         "trust": "learning_curve residuals uncertainty",
     }
     __getattr__, _ = lazy_names(__name__, modules)

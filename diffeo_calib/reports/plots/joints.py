@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import Part, parts
-from diffeo_calib.calibration.recalibration.compare import ModelComparison
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
@@ -155,30 +154,3 @@ def joint_values(robot: Tree, joint: int, values: Tensor) -> Tensor:
 def joint_label(robot: Tree, joint: int) -> str:
     """Name and unit of a joint."""
     return f"{short(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"
-
-
-COMPARISON_BINS = 12
-"""Intervals of a joint's range."""
-
-
-def comparison(found: ModelComparison, robot: Tree, title: str = "") -> Figure:
-    """Draw the distance between two models against every joint, beside what their uncertainties explain.
-
-    Args:
-        found: the comparison. robot: names and kinds of the joints. title: one line that names the models.
-    """
-    figure, grid = panels(robot.n, columns=3, title=title)
-    lengths = found.difference.square().sum(-1).mean(1).sqrt(), found.deviation.square().mean(1).sqrt()
-    looks, highest = (("-o", BLUE, "difference"), ("--", GREY, "explained by uncertainty")), 0.0
-    for joint, axes in enumerate(grid):
-        values = joint_values(robot, joint, found.q[:, joint])
-        for what, (style, colour, label) in zip(lengths, looks, strict=True):
-            middles, groups = in_bins(values, 1e3 * what, COMPARISON_BINS, fewest=1)
-            means = [float(group.square().mean().sqrt()) for group in groups]
-            axes.plot(middles, means, style, color=colour, markersize=3, label=label)
-            highest = max(highest, *[mean for mean in means if isfinite(mean)])
-        finish(axes, x=joint_label(robot, joint), y="RMS distance [mm]" if joint % 3 == 0 else "")
-    for axes in grid:
-        axes.set_ylim(0, 1.1 * highest or 1.0)
-    legend(grid[0])
-    return figure
