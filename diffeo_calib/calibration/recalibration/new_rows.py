@@ -1,16 +1,15 @@
 """New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
 
-    r = y - h(k1(q; m)) = S u + e + noise,    cov(r) = A C(q, q) A^T + S diag(sd^2) S^T + R,
-
-h what was measured and A its slopes, C the posterior covariance of the old fit, u the errors of the places of devices
-and markers, which were found before (new_set_up.py), sd their prior deviations, R the noise of the old rows.
+They are residuals y - h(k1(q; m)) of what was measured, h, from devices and markers that were found before
+(new_set_up.py), and whose places are known by their prior deviations (linear_rows.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import log, nan
+from math import log
 from typing import Any
 
 import torch
@@ -25,7 +24,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.estimate import row_blocks
+from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.linearisation import Linearisation
@@ -63,6 +62,7 @@ class NewRows:
         tails: weights of the rows.
         observe: what was measured of the markers; their coordinates by default.
         placement: devices that stand around the old model; what is not known of them, rows share.
+        drifts: (M R, c) columns of unit variance of what has changed in the robot since, m.
     """
 
     before: Before
@@ -75,6 +75,7 @@ class NewRows:
     tails: Tails
     observe: Observation | None = None
     placement: Placement = Placement()  # noqa: RUF009  # frozen
+    drifts: Tensor | None = None
 
     @classmethod
     def of(cls, before: Before, markers: Tensor, marker_deviation: float) -> NewRows:
@@ -161,36 +162,29 @@ class NewRows:
         return self.y.new_zeros(*self.y.shape, 0) if found is None else found
 
     @cached_property
+    def by_fit(self) -> Tensor:
+        """(M R, M R) covariance of the old model at the rows, m^2."""
+        return self.fitted.covariance_between(self.at)
+
+    @cached_property
+    def given(self) -> LinearRows:
+        """The rows to first order, with their weights."""
+        k = self.shifts.shape[2]
+        C = self.by_fit if self.drifts is None else self.by_fit + self.drifts @ self.drifts.T
+        seen, none = self.noise_model.coordinates(self.y), C.new_zeros(k, k)
+        prior = torch.eye(k, dtype=C.dtype, device=C.device)
+        return LinearRows(self.residual, self.shifts, C, self.weighted_noise, seen, prior, none[0], none)
+
+    @property
     def posterior(self) -> Tensor:
-        """(M R, M R) covariance of the old model at the rows, devices and markers free, m^2."""
-        flat = self.shifts.flatten(0, 1)
-        total = self.fitted.covariance_between(self.at) + flat @ flat.T
+        """(M R, M R) covariance of the rows without noise, devices and markers free, m^2."""
+        total = self.given.C + self.given.slopes @ self.given.slopes.T
         return 0.5 * (total + total.T)
 
     @property
     def weighted_noise(self) -> Tensor:
         """(M, m, m) covariance of the rows with their weights, m^2."""
         return self.noise_model.weighted(self.noise, self.tails)
-
-    @cached_property
-    def factor(self) -> Tensor:
-        """Cholesky factor of the covariance (M m, M m) of the residuals."""
-        return torch.linalg.cholesky(Noise(self.weighted_noise).add_to(self.posterior))
-
-    @cached_property
-    def solved(self) -> Tensor:
-        """(M, m, 1) covariance^-1 r."""
-        return torch.cholesky_solve(self.residual.reshape(-1, 1), self.factor).view(*self.y.shape, 1)
-
-    @cached_property
-    def precisions(self) -> Tensor:
-        """(M, m, m) blocks of covariance^-1: of each row's error as the old model and all other rows predict it."""
-        return row_blocks(torch.cholesky_inverse(self.factor), len(self))
-
-    @property
-    def log_evidence(self) -> float:
-        """log N(r; 0, covariance), but for a constant."""
-        return float(-0.5 * (self.residual * self.solved[..., 0]).sum() - self.factor.diagonal().log().sum())
 
     def with_weights(self) -> NewRows:
         """The same rows with the weights of Student's t, by expectation maximisation."""
@@ -214,34 +208,21 @@ class NewRows:
         vars(other).update(seen=(points[index], at.rows(index)), shifts=self.shifts[index])
         return other
 
-    def if_drifting(self, roots: list[Tensor]) -> NewRows:
-        """The rows where parts with these covariances drift, with weights that hold then: a change is no outlier.
+    def drifting(self, roots: Sequence[Tensor]) -> NewRows:
+        """The rows where parts with these columns (M, R, c) of their covariance drift, m."""
+        own = [] if self.drifts is None else [self.drifts]
+        return self.changed(drifts=torch.cat([*own, *(root.flatten(0, 1) for root in roots)], 1)) if roots else self
 
-        Args:
-            roots: (M, m, c) columns of each part's covariance, m.
-        """
-        together = torch.cat(roots, 2).flatten(0, 1)
-        return self.with_posterior(self.posterior + together @ together.T).with_weights()
-
-    def with_posterior(self, posterior: Tensor) -> NewRows:
-        """The same rows with another covariance (M m, M m) without noise, m^2."""
-        other = self.changed()
-        vars(other)["posterior"] = posterior
-        return other
+    def if_drifting(self, roots: Sequence[Tensor]) -> NewRows:
+        """The same with weights that hold then: a change is no outlier."""
+        return self.drifting(roots).with_weights()
 
     def changed(self, **changes: object) -> NewRows:
-        """The same rows with other noise, weights or deviation of the markers; what does not change is kept."""
+        """The same rows with other noise, weights or drifts; what does not change is kept."""
         other = replace(self, **changes)
-        keep = ["seen", "slopes", "at", "residual", "centre", "by_devices"]
-        keep += [] if "marker_deviation" in changes else ["shifts", "posterior"]
+        keep = "seen", "slopes", "at", "residual", "centre", "by_devices", "shifts", "by_fit"
         vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
         return other
-
-    @property
-    def left_out(self) -> Tensor:
-        """(M, m) how far each row is from its prediction by the old model and the other rows, m; NaN where hidden."""
-        errors = torch.linalg.solve(self.precisions, self.solved)[..., 0]
-        return errors.masked_fill(~self.noise_model.coordinates(errors), nan)
 
     @property
     def new_noise(self) -> Tensor:
@@ -267,8 +248,8 @@ class NewRows:
         The scales were chosen for another session, with few rows of other places, temperatures or loads. The errors of
         every new row as predicted by the old model and all others judge them, see :func:`region_scale`.
         """
-        covariance, noise = torch.linalg.inv(self.precisions), self.noise
-        error = covariance @ self.solved
+        covariance, noise = torch.linalg.inv(self.given.precisions), self.noise
+        error = covariance @ self.given.solved[..., None]
         if self.observe is None and self.fitted.slopes is None:
             noise = noise * (self.new_noise.trace() / self._mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
@@ -276,36 +257,21 @@ class NewRows:
 
     def _expected_squares(self) -> Tensor:
         """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
-        noise = self.weighted_noise
-        error = noise @ self.solved
-        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ self.precisions @ noise)
-
-    @cached_property
-    def after_placing(self) -> Tensor:
-        """(M R, M R) what becomes of errors once devices and markers are where the rows fit best.
-
-        They are weighed by the noise alone, as in a registration: weights by the covariance of the model would leave
-        centimetres in the rows where the model is uncertain by as much, although another place explains them.
-        """
-        flat = self.shifts.flatten(0, 1)
-        weighted = torch.linalg.solve(self.weighted_noise, self.shifts).flatten(0, 1)
-        eye = torch.eye(flat.shape[1], dtype=flat.dtype, device=flat.device)
-        gain = torch.linalg.solve(eye + flat.T @ weighted, weighted.T)
-        return torch.eye(len(flat), dtype=flat.dtype, device=flat.device) - flat @ gain
+        noise, given = self.weighted_noise, self.given
+        error = noise @ given.solved[..., None]
+        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ given.precisions @ noise)
 
     @property
     def placed_residual(self) -> Tensor:
         """(M, R) residuals with devices and markers where the rows put them, m; NaN where hidden."""
-        left = (self.after_placing @ self.residual.flatten()).view(self.y.shape)
-        return left.masked_fill(~self.noise_model.coordinates(left), nan)
+        return self.given.shown(self.given.after_placing @ self.given.target)
 
     @property
     def expected_residual(self) -> Tensor:
         """(M, R) standard deviations of these that model and noise lead to expect, m; NaN where hidden."""
-        flat = self.shifts.flatten(0, 1)
-        total = Noise(self.noise).add_to(self.posterior - flat @ flat.T)
-        variances = ((self.after_placing @ total) * self.after_placing).sum(1).clamp(min=0.0)
-        return variances.sqrt().view(self.y.shape).masked_fill(~self.noise_model.coordinates(self.y), nan)
+        placed = self.given.after_placing
+        variances = ((placed @ Noise(self.noise).add_to(self.given.C)) * placed).sum(1).clamp(min=0.0)
+        return self.given.shown(variances.sqrt())
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
@@ -315,8 +281,7 @@ class NewRows:
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        squares = (self.solved.mT @ torch.linalg.solve(self.precisions, self.solved)).flatten()
-        squares = squares / self.noise_model.coordinates(self.y).sum(1)
+        squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
         return float(squares.median().sqrt())
 
     def levelled(self, roots: list[Tensor]) -> NewRows:
@@ -327,15 +292,14 @@ class NewRows:
         """
         kinds = self.noise_model.kinds
         kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
-        together = torch.cat(roots, 2).flatten(0, 1) if roots else self.y.new_zeros(self.y.numel(), 0)
-        rows = self.with_posterior(self.posterior + together @ together.T)
+        rows = self.drifting(roots)
         for kind in range(int(self.fitted.slopes is None), int(kinds.max()) + 1):
             own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1)
             own = own & self.noise_model.coordinates(self.y)
             levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
             prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
-            logs = [each.with_posterior(rows.posterior).log_evidence + p for each, p in zip(levels, prior, strict=True)]
-            rows = levels[logs.index(max(logs))].with_posterior(rows.posterior)
+            logs = [each.given.log_evidence() + p for each, p in zip(levels, prior, strict=True)]
+            rows = levels[logs.index(max(logs))]
         return self.changed(noise=rows.noise)
 
 

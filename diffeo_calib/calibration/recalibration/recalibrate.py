@@ -235,7 +235,7 @@ def _result(
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
     again.placement = _with_settled(devices_beside(again, new), model, place, rows, fitted)
-    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.left_out))
+    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.given.left_out))
     if model.summary is not None:
         known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
         certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
@@ -304,7 +304,7 @@ def weighed(before: Before, marker: str) -> NewRows:
         name = REGISTERED_AS[place.best.metres]
         return _rows(before, places[name], name).with_weights()
     every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
-    return max(every.items(), key=lambda each: each[1].log_evidence + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
+    return max(every.items(), key=lambda each: each[1].given.log_evidence() + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
 
 
 def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:

@@ -17,7 +17,6 @@ from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.recalibration.changed_parts import ChangedPart, parts_of
 from diffeo_calib.calibration.recalibration.changes import Drift
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.maps.noise import Noise
 
 USUAL_LOG, EFOLDS = -6.0, 2.5
 """Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
@@ -42,10 +41,10 @@ def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
     roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
     known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
     doubted = rows.if_drifting([*known, *roots])
-    base = rows.posterior if not known else rows.if_drifting(known).posterior
+    base = rows.drifting(known).posterior
     residual, columns, sizes = rows.residual.flatten(), [root.flatten(0, 1) for root in roots], None
     for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
-        sizes, odds = _likeliest(Noise(weighed.weighted_noise).add_to(base), columns, residual)
+        sizes, odds = _likeliest(base + torch.block_diag(*weighed.weighted_noise), columns, residual)
         if odds < least:
             return []
     return [Drift(part, size) for parts, size in zip(groups.values(), sizes or [], strict=True) for part in parts]
