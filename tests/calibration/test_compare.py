@@ -151,8 +151,8 @@ def test_ratios_are_those_of_the_definition() -> None:
     shapes, roots, noise = normal(18, 4), {"a": normal(6, 3, 2), "b": normal(6, 3, 1)}, normal(6, 3, 5)
     base, noise = shapes @ shapes.T, noise @ noise.mT
     residual = 3.0 * roots["a"] @ normal(2) + normal(6, 3)
-    seen = SimpleNamespace(coordinates=lambda y: torch.ones_like(y, dtype=torch.bool))
-    rows: Any = SimpleNamespace(weighted_noise=noise, noise_model=seen, y=residual, residual=residual, posterior=base)
+    seen = torch.ones_like(residual, dtype=torch.bool)
+    rows: Any = SimpleNamespace(weighted_noise=noise, visible=seen, residual=residual, posterior=base)
     found, level = likelihood_ratios(rows, roots, seed=0)
 
     def densities(root: Tensor, sizes: Tensor) -> Tensor:  # (noise, sizes)

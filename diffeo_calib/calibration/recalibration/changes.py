@@ -71,7 +71,7 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     """
     base = rows.posterior
     R = torch.block_diag(*rows.weighted_noise)
-    seen = rows.noise_model.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
+    seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
     factors = [torch.linalg.cholesky(base + f * R) for f in NOISE_FACTORS.to(base)]
 
@@ -314,7 +314,7 @@ def _smallest(rows: NewRows) -> tuple[SmallestOffset, ...]:
     """See :class:`Changes`."""
     chain, found = rows.points.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows)):
-        evidence = _evidence(rows, part)
+        evidence = rows.evidence(part.root(rows.at))
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
         size = size if size < LARGEST_OFFSET_RAD_M else inf
         found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
@@ -328,15 +328,10 @@ def within_old_range(rows: NewRows) -> Tensor:
     return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
-def _evidence(rows: NewRows, part: ChangedPart) -> Evidence:
-    E = part.root(rows.at).flatten(0, 1)
-    return Evidence(E.T @ rows.given.solved.flatten(), E.T @ rows.given.factor.solve(E))
-
-
 def _change(rows: NewRows, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
     """The change with its expected size."""
     (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
-    evidence = _evidence(rows, part)
+    evidence = rows.evidence(part.root(rows.at))
     moved = part.root(rows.seen[1]) @ (variance * evidence.g)
     size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
     deviation = None

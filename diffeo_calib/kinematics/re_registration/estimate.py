@@ -10,7 +10,7 @@ pairs, which may hide each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
 
@@ -19,15 +19,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows, NewDate
 from diffeo_calib.kinematics.re_registration.session import Session
 from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.set_ups import frame_slopes
 
 MAX_STEPS = 100
 SMALL_STEP = 1e-2
@@ -43,43 +41,53 @@ MOST_PAIRS = 800
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A frame T (4, 4), m, and markers (P, 3) on their tips, and what the rows say from there.
+    """A frame T (4, 4), m, and markers on their tips, and what the rows say from there.
 
     Args:
-        metres: prior deviation of the markers from their old places.
-        points: (M, P, 3) of the model, m. slopes: (M, 3 P, 3 P) of these by the markers.
-        C: (3 P M, 3 P M) their posterior covariance by the fit.
+        metres: prior deviation of the markers from their old places. date: the rows, seen from there.
     """
 
     session: Session
     metres: float
     T: Tensor
-    markers: Tensor
-    points: Tensor
-    slopes: Tensor
-    C: Tensor
+    date: NewDate
 
     @classmethod
-    def at(cls, session: Session, metres: float, T: Tensor, markers: Tensor, C: Tensor | None = None) -> Estimate:
-        """The rows from there; C is passed if it is known already."""
-        points = FlangePoints(session.nominal, markers, same=session.same)
-        deformation = session.fitted.geodesic.with_nominal(points)
-        value, at = deformation.linearised_value(session.data.q)
-        C = session.fitted.covariance_between(at) if C is None else C
-        slopes = marker_slopes(deformation, points, at)
-        return cls(session, metres, T, markers, value.unflatten(1, (-1, 3)), slopes, C)
+    def at(cls, session: Session, metres: float, T: Tensor, markers: Tensor) -> Estimate:
+        """With the markers (P, 3) there, m."""
+        visible, free = measured_coordinates(session.noise), session.free
+        date = NewDate(
+            fitted=session.fitted,
+            points=FlangePoints(session.nominal, markers, same=session.same),
+            q=session.data.q,
+            y=session.seen(T).flatten(1).nan_to_num(0.0),
+            noise=session.noise,
+            visible=visible,
+            shared=session.shared,
+            deviations=free * markers.new_tensor([PLACES.sought_base_m_rad] * 6 + [metres] * (len(free) - 6)),
+            centre=session.centre,
+            observe=None,
+        )
+        return cls(session, metres, T, date)
 
-    def settled(self) -> Estimate:
-        """The best one under the prior, by Gauss-Newton."""
-        found, centre = self, self.session.centre
+    @property
+    def markers(self) -> Tensor:
+        """(P, 3) m."""
+        return self.date.points.points
+
+    def settled(self, metres: float) -> Estimate:
+        """The best one under a prior, by Gauss-Newton."""
+        found, centre = Estimate.at(self.session, metres, self.T, self.markers), self.session.centre
+        found = replace(found, date=self.date.changed(deviations=found.date.deviations))
         for _ in range(MAX_STEPS):
-            step = self.C.new_zeros(len(self.session.free)).index_copy(0, self.free, found.rows.step)
+            step = centre.new_zeros(len(self.session.free)).index_copy(0, self.free, found.rows.step)
             if float(step.abs().max()) < SETTLED:
                 break
-            turn = rotation(step[3:6])
+            turn, before = rotation(step[3:6]), found.date
             T = found.T @ transforms(turn, centre + step[:3] - turn @ centre)
-            C = found.C if float(step[6:].abs().max()) < SMALL_STEP else None
-            found = Estimate.at(self.session, self.metres, T, found.markers + step[6:].view(-1, 3), C)
+            found = Estimate.at(self.session, metres, T, found.markers + step[6:].view(-1, 3))
+            if float(step[6:].abs().max()) < SMALL_STEP:
+                vars(found.date)["by_fit"] = before.by_fit
         return found
 
     @cached_property
@@ -90,19 +98,16 @@ class Estimate:
     @cached_property
     def rows(self) -> LinearRows:
         """By the free unknowns; what is held is as an earlier registration knows it."""
-        own, both, moved = self.session, (self.free[:, None], self.free), (self.markers - self.session.old).flatten()
-        S = torch.cat([frame_slopes(self.points, own.centre), self.slopes], -1)
-        Z, held = own.shared.flatten(0, 1), S.flatten(0, 1) * ~own.free
-        wide = moved.new_full((6,), PLACES.sought_base_m_rad)
-        prior = own.earlier + torch.diag(torch.cat([wide, torch.full_like(moved, self.metres)]).square())
+        own, date, both = self.session, self.date, (self.free[:, None], self.free)
+        Z, held = date.shared.flatten(0, 1), date.by_places.flatten(0, 1) * ~own.free
         return LinearRows(
-            residual=(own.seen(self.T) - self.points).nan_to_num(0.0).flatten(1),
-            S=S[..., self.free],
-            C=self.C + Z @ Z.mT + held @ own.earlier @ held.mT,
-            noise=own.noise,
-            visible=measured_coordinates(own.noise),
-            prior=prior[both],
-            mean=torch.cat([moved.new_zeros(6), -moved])[self.free],
+            residual=date.residual,
+            S=date.by_places[..., self.free],
+            C=date.by_fit + Z @ Z.mT + held @ own.earlier @ held.mT,
+            noise=date.noise,
+            visible=date.visible,
+            prior=(own.earlier + torch.diag(date.deviations.square()))[both],
+            mean=torch.cat([own.centre.new_zeros(6), (own.old - self.markers).flatten()])[self.free],
             by_fit=own.by_fit[both],
         )
 

@@ -19,15 +19,107 @@ much is left in the rows, although another place explains it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.nominal import FlangePoints
+from diffeo_calib.kinematics.re_registration.registered_map import place_slopes
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.regression.factor import Factor
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+@dataclass(frozen=True, eq=False)
+class NewDate:
+    """M rows of a new set-up in the frame of a fit.
+
+    Args:
+        fitted: the map of the fit. points: k0 of the markers where they are now, under the payloads of the rows.
+        q: (M, n). y: (M, R) measured numbers, m; any where hidden. noise: (M, R, R) m^2.
+        visible: (M, R) boolean, the numbers that were measured.
+        shared: (M, R, c) effects of errors of unit variance that they share, m.
+        deviations: (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of
+            what has not moved. centre: (3,) about which the frame turns, m.
+        observe: what was measured of the markers; None for their coordinates.
+    """
+
+    fitted: FittedMap
+    points: FlangePoints
+    q: Tensor
+    y: Tensor
+    noise: Tensor
+    visible: Tensor
+    shared: Tensor
+    deviations: Tensor
+    centre: Tensor
+    observe: Observation | None
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @cached_property
+    def seen(self) -> tuple[Tensor, Linearisation]:
+        """The points (M, 3 P) by the fit, m, and their linearisation."""
+        points, at = self.fitted.geodesic.with_nominal(self.points).linearised_value(self.q)
+        return points.detach(), at
+
+    @cached_property
+    def slopes(self) -> Tensor | None:
+        """(M, R, 3 P) of what was measured; None for all coordinates."""
+        return None if self.observe is None else self.observe.slope(self.seen[0]).detach()
+
+    @cached_property
+    def at(self) -> Linearisation:
+        """Linearised prediction of the fit for the measured numbers."""
+        return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """(M, R) measured minus predicted, m; zero where hidden."""
+        away = self.y - (self.seen[0] if self.observe is None else self.observe.value(self.seen[0]))
+        return away.masked_fill(~self.visible, 0.0)
+
+    @cached_property
+    def by_places(self) -> Tensor:
+        """(M, R, 6 + 3 P) derivatives by frame and markers."""
+        deformation = self.fitted.geodesic.with_nominal(self.points)
+        found = place_slopes(deformation, self.seen[1], self.seen[0], self.centre)
+        return found if self.slopes is None else self.slopes @ found
+
+    @cached_property
+    def by_fit(self) -> Tensor:
+        """(M R, M R) posterior covariance of the fit at the rows, m^2."""
+        return self.fitted.covariance_between(self.at)
+
+    @property
+    def weighted_noise(self) -> Tensor:
+        """(M, R, R) covariance of the rows with their weights, m^2."""
+        return self.noise
+
+    @property
+    def mean_noise(self) -> Tensor:
+        """(R, R) covariance of a new measurement, m^2: that of the fit for points that no row shows."""
+        found, unseen = mean_block(self.noise, self.visible), ~self.visible.any(0)
+        both = unseen[:, None] & unseen
+        return torch.where(both, self.fitted.new_noise, found) if bool(unseen.any()) else found
+
+    def changed(self, **changes: object) -> Self:
+        """The same rows with another noise or prior; what does not change is kept."""
+        other = replace(self, **changes)
+        keep = "seen", "slopes", "at", "residual", "by_places", "by_fit"
+        vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
+        return other
 
 
 @dataclass(frozen=True, eq=False)

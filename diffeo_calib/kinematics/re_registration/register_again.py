@@ -21,8 +21,8 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates, joins
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.both_dates import both_dates, joins
 from diffeo_calib.kinematics.re_registration.estimate import Estimate
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
@@ -33,7 +33,6 @@ from diffeo_calib.kinematics.re_registration.registered_map import (
     undetermined,
 )
 from diffeo_calib.kinematics.re_registration.session import Session
-from diffeo_calib.maps.noise import mean_block
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
@@ -44,9 +43,13 @@ from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
-SAME_PLACE, OTHER_MARKER = PLACES.same_registered_m, PLACES.other_registered_m
-"""Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
-MARKER_DEVIATIONS = (SAME_PLACE, PLACES.remounted_m, OTHER_MARKER)
+MARKER_DEVIATIONS = {
+    "same": (PLACES.same_registered_m, PLACES.same_m),
+    "moved": (PLACES.remounted_m, PLACES.remounted_m),
+    "other": (PLACES.other_registered_m, PLACES.other_m),
+}
+"""Prior standard deviations, m, of markers from where they were, in a registration, and from where it found them."""
+SAME_PLACE, OTHER_MARKER = MARKER_DEVIATIONS["same"][0], MARKER_DEVIATIONS["other"][0]
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 MOST_ROWS = 200
@@ -94,23 +97,12 @@ STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
 
 def _learnt(fit: FittedMap, nominal: GeometryMap, found: Estimate) -> FittedMap:
     """The fit conditioned on the rows that took part, too, in its own frame, as if nothing but places had changed."""
-    session = found.session
-    framed, may = bool(session.free[0]), session.free[6:].view(-1, 3).any(1)
-    metres = PLACES.same_m if found.metres == SAME_PLACE else found.metres
-    new = NewDate(
-        markers=session.old if found.metres == SAME_PLACE else found.markers,
-        payload=session.nominal.payload,
-        q=session.data.q,
-        y=session.seen(found.T).flatten(1).nan_to_num(0.0),
-        noise=session.noise,
-        seen=found.rows.visible,
-        shared=session.shared,
-        new_noise=_mean_noise(found),
-        frame=PLACES.found_m_rad * framed,
-        free=metres * may.repeat_interleave(3).to(session.noise),
-        centre=session.centre,
-    )
-    problem, start = both_dates(fit, nominal, new, [], found.inflation)
+    new, same = found.date, found.metres == SAME_PLACE
+    known = torch.full_like(new.deviations, PLACES.found_m_rad)
+    known[6:] = PLACES.same_m if same else found.metres
+    points = FlangePoints(new.points.fitted, found.session.old, same=True) if same else new.points
+    new = replace(new, points=points, deviations=known * found.session.free)
+    problem, start = both_dates(nominal, new, new.mean_noise, [], found.inflation)
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
@@ -248,7 +240,7 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
         return (SAME_PLACE,)  # not used: the markers stay
     if marker_std is not None:
         return (marker_std,)
-    return MARKER_DEVIATIONS if known else (OTHER_MARKER,)
+    return tuple(first for first, _ in MARKER_DEVIATIONS.values()) if known else (OTHER_MARKER,)
 
 
 def _starts(session: Session, widest: float) -> list[Estimate]:
@@ -266,8 +258,7 @@ def _starts(session: Session, widest: float) -> list[Estimate]:
 def _likeliest(starts: list[Estimate], metres: float) -> Estimate:
     """The likeliest estimate under a prior."""
     usable = starts if metres >= OTHER_MARKER else starts[:1]
-    every = [replace(start, metres=metres).settled() for start in usable]
-    return max(every, key=lambda each: each.rows.log_evidence())
+    return max((start.settled(metres) for start in usable), key=lambda each: each.rows.log_evidence())
 
 
 def _odds(found: dict[float, Estimate]) -> dict[float, float]:
@@ -304,20 +295,12 @@ def _record(best: Estimate, said: dict[str, Any]) -> Registration:
         centre=R @ session.centre + best.T[:3, 3],
         q=session.data.q,
         gain=((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(best.inflation * _mean_noise(best), R),
+        noise=turned(best.inflation * best.date.mean_noise, R),
         rms_after=_rms(rows.shown(rows.residual).unflatten(1, (-1, 3))),
         left_out_rms=_rms(rows.left_out.unflatten(1, (-1, 3))),
         undetermined=undetermined(covariance, markers, arm, usual, tips, rigid=lever is not None),
         **said,
     )
-
-
-def _mean_noise(best: Estimate) -> Tensor:
-    """Covariance (m, m) of a new measurement, m^2: that of the fit for points that no row shows."""
-    session = best.session
-    found, unseen = mean_block(session.noise, best.rows.visible), ~best.rows.visible.any(0)
-    both = unseen[:, None] & unseen
-    return torch.where(both, session.fitted.new_noise, found) if bool(unseen.any()) else found
 
 
 def _rms(errors: Tensor) -> float:

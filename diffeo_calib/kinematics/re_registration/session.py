@@ -126,12 +126,10 @@ class Session:
         before, found = self.model.registration, self.noise.new_zeros(len(self.free), len(self.free))
         if before is None:
             return found
-        arms = torch.eye(6, dtype=found.dtype, device=found.device)
-        arms[:3, 3:] = -skew(self.centre - before.centre)
-        if self.known:
-            to = torch.block_diag(arms, torch.eye(self.old.numel(), dtype=found.dtype, device=found.device))
-            return to @ before.covariance @ to.mT
-        found[:6, :6] = arms @ before.covariance[:6, :6] @ arms.mT
+        size = len(found) if self.known else 6
+        to = torch.eye(size, dtype=found.dtype, device=found.device)
+        to[:3, 3:6] = -skew(self.centre - before.centre)
+        found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
         return found
 
     @cached_property
