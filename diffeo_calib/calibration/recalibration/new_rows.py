@@ -104,8 +104,8 @@ class NewRows(NewDate):
     @cached_property
     def given(self) -> LinearRows:
         """The rows to first order, with their weights."""
-        k = self.shifts.shape[2]
-        C = self.by_fit if self.drifts is None else self.by_fit + self.drifts @ self.drifts.T
+        k, C = self.shifts.shape[2], self.fit_covariance
+        C = C if self.drifts is None else C + self.drifts @ self.drifts.T
         none, prior = C.new_zeros(k, k), torch.eye(k, dtype=C.dtype, device=C.device)
         return LinearRows(self.residual, self.shifts, C, self.weighted_noise, self.visible, prior, none.sum(0), none)
 

@@ -87,7 +87,7 @@ class Estimate:
             T = found.T @ transforms(turn, centre + step[:3] - turn @ centre)
             found = Estimate.at(self.session, metres, T, found.markers + step[6:].view(-1, 3))
             if float(step[6:].abs().max()) < SMALL_STEP:
-                vars(found.date)["by_fit"] = before.by_fit
+                vars(found.date)["fit_covariance"] = before.fit_covariance
         return found
 
     @cached_property
@@ -103,7 +103,7 @@ class Estimate:
         return LinearRows(
             residual=date.residual,
             S=date.by_places[..., self.free],
-            C=date.by_fit + Z @ Z.mT + held @ own.earlier @ held.mT,
+            C=date.fit_covariance + Z @ Z.mT + held @ own.earlier @ held.mT,
             noise=date.noise,
             visible=date.visible,
             prior=(own.earlier + torch.diag(date.deviations.square()))[both],

@@ -98,7 +98,7 @@ class NewDate:
         return found if self.slopes is None else self.slopes @ found
 
     @cached_property
-    def by_fit(self) -> Tensor:
+    def fit_covariance(self) -> Tensor:
         """(M R, M R) posterior covariance of the fit at the rows, m^2."""
         return self.fitted.covariance_between(self.at)
 
@@ -117,7 +117,7 @@ class NewDate:
     def changed(self, **changes: object) -> Self:
         """The same rows with another noise or prior; what does not change is kept."""
         other = replace(self, **changes)
-        keep = "seen", "slopes", "at", "residual", "by_places", "by_fit"
+        keep = "seen", "slopes", "at", "residual", "by_places", "fit_covariance"
         vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
         return other
 
