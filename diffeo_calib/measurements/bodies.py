@@ -1,13 +1,13 @@
 """Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both.
 
 A body has an origin, the marker itself or that of its frame, and numbers that tell where it is: three coordinates, of
-frames a rotation vector too. In a registration it is an unknown around its old place.
+frames a rotation vector too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -31,8 +31,6 @@ from diffeo_calib.measurements.pose_frames import (
 from diffeo_calib.measurements.poses import angle_between, check_lever, mark_points, rotation_numbers
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import BALL
-from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.se3 import rotation, skew
 
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -203,11 +201,6 @@ class Bodies:
             raise InputError.of(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points")
         return self.lever
 
-    def at(self, old: Tensor) -> Body:
-        """As unknowns around old places (P, 3), m."""
-        turn = torch.eye(3, dtype=old.dtype, device=old.device).expand(len(old) // self.points, 3, 3)
-        return Body(old, self.lever, turn, torch.zeros_like(turn[:, 0]))
-
     def nowhere(self, points: int, like: Tensor) -> Tensor:
         """Old places (P, 3) of bodies that nobody has seen: at the tip, m."""
         if self.lever is None:
@@ -262,72 +255,6 @@ def seen_board(data: Any) -> SeenBoard | None:
         return None
     axes = data.poses[:, :3, :3]
     return SeenBoard(data.board, data.poses[:, :3, 3] + (axes @ data.board[..., None])[..., 0], axes, data.lever)
-
-
-@dataclass(frozen=True)
-class Body:
-    """The points of the tool as unknowns around their old places, each marker or measured frame on its own.
-
-    Its d unknowns are for each body a shift [m] and, of a frame, a turn [rad] about its origin: d = 3 P or 6 T.
-
-    Args:
-        old: (P, 3) places that the prior prefers, m.
-        lever: distance of the points of a frame from its origin, m; None for markers.
-        turn: (B, 3, 3) and shift: (B, 3) of the old points of each body about its origin, m.
-    """
-
-    old: Tensor
-    lever: float | None
-    turn: Tensor
-    shift: Tensor
-
-    @property
-    def _numbers(self) -> int:
-        return 3 if self.lever is None else 6
-
-    def _by_body(self, points: Tensor) -> Tensor:
-        return points.unflatten(0, (len(self.turn), -1))
-
-    @property
-    def points(self) -> Tensor:
-        """(P, 3) the present places, m."""
-        old = self._by_body(self.old)
-        centre = old.mean(1, keepdim=True)
-        return ((old - centre) @ self.turn.mT + centre + self.shift[:, None]).flatten(0, 1)
-
-    @property
-    def slopes(self) -> Tensor:
-        """(3 P, d) derivatives of the present places by the unknowns."""
-        points = self._by_body(self.points)
-        eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
-        own = torch.cat([eye, -skew(points - points.mean(1, keepdim=True))], -1)[..., : self._numbers].flatten(1, 2)
-        return torch.block_diag(*own)
-
-    @property
-    def from_old(self) -> Tensor:
-        """(d,) the unknowns that lead from the old places to the present ones, to first order at the present."""
-        if self.lever is None:
-            return self.shift.flatten()
-        return torch.cat([self.shift, rotation_numbers(self.turn, "rotvec").to(self.shift.device)], 1).flatten()
-
-    def stepped(self, step: Tensor) -> Body:
-        """After a step (d,) of the unknowns."""
-        each = torch.nn.functional.pad(step.view(-1, self._numbers), (0, 6 - self._numbers))
-        shift, turn = each.split(3, 1)
-        return replace(self, shift=self.shift + shift, turn=rotation(turn) @ self.turn)
-
-    def at(self, points: Tensor) -> Body:
-        """The body at the places nearest to these (P, 3)."""
-        old, new = self._by_body(self.old), self._by_body(points)
-        turn = self.turn
-        if self.lever is not None:
-            turn = torch.stack([rigid_fit(*pair)[:3, :3] for pair in zip(old, new, strict=True)])
-        return replace(self, turn=turn, shift=(new - old).mean(1))
-
-    def deviations(self, metres: float) -> Tensor:
-        """(d,) prior standard deviations of a body that may have moved by this distance, m."""
-        sizes = [metres] * 3 + ([] if self.lever is None else [metres / self.lever] * 3)
-        return torch.tensor(sizes * len(self.turn), dtype=self.old.dtype, device=self.old.device)
 
 
 def matrix_lines(transform: Tensor) -> Iterator[str]:

@@ -54,10 +54,10 @@ def test_errors_that_other_places_explain_are_none() -> None:
     """However unsure a model is, device and marker are where the rows fit best, and that much is expected of them."""
     rows = weighed(place_again(model(positions), positions(arm(), 12, seed=5)), "evidence")
     flat = rows.shifts.flatten(0, 1)
-    unsure = rows.with_posterior(rows.posterior + 25.0 * flat @ flat.T)  # errors of the model look like other places
+    unsure = rows.drifting([5.0 * rows.shifts])  # errors of the model look like other places
     away = flat @ torch.linspace(-0.02, 0.02, flat.shape[1], dtype=torch.float64)
     for one in (rows, unsure):
-        assert float((one.after_placing @ away).norm()) < 0.02 * float(away.norm())
+        assert float((one.given.after_placing @ away).norm()) < 0.02 * float(away.norm())
         errors, expected = (float(each.square().mean().sqrt()) for each in (one.placed_residual, one.expected_residual))
         assert 0.4 < errors / expected < 2.5
 
@@ -151,9 +151,9 @@ def test_ratios_are_those_of_the_definition() -> None:
     shapes, roots, noise = normal(18, 4), {"a": normal(6, 3, 2), "b": normal(6, 3, 1)}, normal(6, 3, 5)
     base, noise = shapes @ shapes.T, noise @ noise.mT
     residual = 3.0 * roots["a"] @ normal(2) + normal(6, 3)
-    seen = SimpleNamespace(coordinates=lambda y: torch.ones_like(y, dtype=torch.bool))
-    rows: Any = SimpleNamespace(weighted_noise=noise, noise_model=seen, y=residual, residual=residual)
-    found, level = likelihood_ratios(rows, base, roots, seed=0)
+    seen = torch.ones_like(residual, dtype=torch.bool)
+    rows: Any = SimpleNamespace(weighted_noise=noise, visible=seen, residual=residual, posterior=base)
+    found, level = likelihood_ratios(rows, roots, seed=0)
 
     def densities(root: Tensor, sizes: Tensor) -> Tensor:  # (noise, sizes)
         columns = root.flatten(0, 1)

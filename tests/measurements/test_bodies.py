@@ -69,20 +69,6 @@ def test_the_ball_in_sockets_is_a_kind_of_its_own_beside_others_alone() -> None:
     assert kinds.tolist() == [[0, 0, 1]] * (2 * N)
 
 
-@pytest.mark.parametrize("table", [MARKERS, TIPS])
-def test_bodies_as_unknowns_move_as_their_slopes_say(table: dc.Measurements) -> None:
-    """Against central differences; a body at points that it reaches is there."""
-    body = table.bodies.at(table.points[0])
-    there = body.stepped(0.3 * random(len(body.from_old)))
-    unit = 1e-6 * torch.eye(len(body.from_old), dtype=torch.float64)
-    moved = [(there.stepped(h).points - there.stepped(-h).points).flatten() / 2e-6 for h in unit]
-    assert_close(there.slopes, torch.stack(moved, 1), rtol=0, atol=1e-8)
-    assert_close(body.at(there.points).points, there.points)
-    small = body.stepped(unit[0])
-    assert_close(small.from_old, unit[0], rtol=0, atol=1e-12)
-    assert len(body.deviations(1e-3)) == len(unit)
-
-
 def test_places_are_absent_as_numbers() -> None:
     assert MARKERS.places.tolist() == MARKERS.socket_numbers.tolist() == [-1] * N
     assert SOCKETS.places.tolist() == [0] * 3 + [1] * 4

@@ -231,7 +231,7 @@ def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tenso
 
 def reading_sets(
     readings: Sequence[OtherReadings], devices: Sequence[Devices], beside: Measurements | None = None
-) -> tuple[DeviceSet, ...]:
+) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
     frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
     return tuple(

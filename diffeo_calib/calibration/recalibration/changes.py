@@ -34,7 +34,6 @@ from diffeo_calib.calibration.recalibration.changed_parts import (
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
-from diffeo_calib.maps.noise import Noise
 
 SIMULATED_DRAWS = 2000
 NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
@@ -60,20 +59,19 @@ class Ratio(NamedTuple):
         return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
 
 
-def likelihood_ratios(
-    rows: NewRows, base: Tensor, roots: dict[str, Tensor], seed: int
-) -> tuple[dict[str, Ratio], float]:
+def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
     """Ratios of all parts.
 
     Args:
-        rows: the new rows. base: (M m, M m) covariance without noise and without further changes, m^2.
+        rows: the new rows, with the changes that are known already.
         roots: name -> (M, m, c) columns of each part's covariance, m. seed: of the samples.
 
     Returns:
         name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
     """
-    R = Noise(rows.weighted_noise).add_to(torch.zeros_like(base))
-    seen = rows.noise_model.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
+    base = rows.posterior
+    R = torch.block_diag(*rows.weighted_noise)
+    seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
     factors = [torch.linalg.cholesky(base + f * R) for f in NOISE_FACTORS.to(base)]
 
@@ -281,33 +279,29 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
     parts = {part.name: part for part in (*parts_of(rows), *offsets_of(rows))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
     rows = rows.changed(tails=rows.if_drifting(list(roots.values())).tails)
-    base, drifts, found = rows.posterior, [], {}
-    first, others, noise = {}, {}, 1.0
+    drifts, found, first, others, noise = [], {}, {}, {}, 1.0
     while roots:
-        ratios, factor = likelihood_ratios(rows, base, roots, seed)
+        ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
-        unchanged = rows.with_posterior(base).with_weights()
-        strict, _ = likelihood_ratios(unchanged, base, roots, seed)
+        strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
         ratios = {name: each.least_certain(strict[name]) for name, each in ratios.items()}
         if not first:
             first, noise = ratios, factor
         name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))
         if ratios[name].probability > level:
             break
-        root = roots.pop(name).flatten(0, 1)
-        base = base + ratios[name].variance * (root @ root.T)
+        rows = rows.drifting([ratios[name].variance ** 0.5 * roots.pop(name)])
         drifts.append(Drift(parts[name], ratios[name].variance))
         found[name] = ratios[name]
         least = ratios[name].value - gates.OFFSETS_TOLD_APART
         as_good = [each for each in ratios if each != name and parts[each].offset and ratios[each].value > least]
         others[name] = tuple(as_good) if parts[name].offset else ()
-    factor = torch.linalg.cholesky(Noise(rows.weighted_noise).add_to(base))
     changes = tuple(
-        _change(rows, factor, drift, probability=found[name].probability, others=others[name])
+        _change(rows, drift, probability=found[name].probability, others=others[name])
         for name, drift in zip(found, drifts, strict=True)
     )
     probabilities = {name: ratio.probability for name, ratio in first.items()}
-    return Changes(changes, probabilities, noise, len(rows), level, () if drifts else _smallest(rows, factor)), drifts
+    return Changes(changes, probabilities, noise, len(rows), level, () if drifts else _smallest(rows)), drifts
 
 
 SHOWN = 5.5
@@ -316,11 +310,11 @@ LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
 
 
-def _smallest(rows: NewRows, factor: Tensor) -> tuple[SmallestOffset, ...]:
-    """See :class:`Changes`; ``factor``: Cholesky factor of the covariance of all rows."""
-    chain, found, residual = rows.points.fitted.geometry.chain, [], rows.residual.flatten()
+def _smallest(rows: NewRows) -> tuple[SmallestOffset, ...]:
+    """See :class:`Changes`."""
+    chain, found = rows.points.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows)):
-        evidence = Evidence.by(part.root(rows.at).flatten(0, 1), residual, factor)
+        evidence = rows.evidence(part.root(rows.at))
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
         size = size if size < LARGEST_OFFSET_RAD_M else inf
         found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
@@ -334,10 +328,10 @@ def within_old_range(rows: NewRows) -> Tensor:
     return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
-def _change(rows: NewRows, factor: Tensor, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
-    """The change with its expected size; ``factor``: as above."""
+def _change(rows: NewRows, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
+    """The change with its expected size."""
     (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
-    evidence = Evidence.by(part.root(rows.at).flatten(0, 1), rows.residual.flatten(), factor)
+    evidence = rows.evidence(part.root(rows.at))
     moved = part.root(rows.seen[1]) @ (variance * evidence.g)
     size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
     deviation = None

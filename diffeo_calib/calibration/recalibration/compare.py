@@ -14,10 +14,10 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
     check_arguments,
     place_again,
-    warn_of_moved_markers,
+    warn_of_places,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, changed_offsets, hidden_offsets
-from diffeo_calib.calibration.recalibration.recalibrate import warn_of_scale, weighed
+from diffeo_calib.calibration.recalibration.recalibrate import weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError
@@ -26,7 +26,7 @@ from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
+from diffeo_calib.kinematics.re_registration.register_again import find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
@@ -177,15 +177,13 @@ def compare(
     before = place_again(model, other, marker)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
-    found = before.registration
-    if found is not None:
-        warn_about(found, outliers=not changes.found, excess=not changes.found)
-        warn_of_moved_markers(found, marker)
-    warn_of_scale(rows)
+    warn_of_places(before, marker, outliers=not changes.found, excess=not changes.found)
     usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
-    usual = usual.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
+    usual = usual.masked_fill(~rows.visible, nan)
     errors, expected, usual = map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual))
-    return Comparison(found, changes, errors, expected, usual, hidden_offsets(model.robot, before, changes))
+    return Comparison(
+        before.registration, changes, errors, expected, usual, hidden_offsets(model.robot, before, changes)
+    )
 
 
 def _usual_deviation(model: CalibratedKinematics) -> float:

@@ -1,36 +1,33 @@
 """New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
 
-    r = y - h(k1(q; m)) = S u + e + noise,    cov(r) = A C(q, q) A^T + S diag(sd^2) S^T + R,
-
-h what was measured and A its slopes, C the posterior covariance of the old fit, u the errors of the places of devices
-and markers, which were found before (new_set_up.py), sd their prior deviations, R the noise of the old rows.
+They are residuals y - h(k1(q; m)) of what was measured, h, from devices and markers that were found before
+(new_set_up.py), and whose places are known by their prior deviations (linear_rows.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import log, nan
+from math import log
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
-from diffeo_calib.calibration.placing.readings import ReadingDevices
+from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.estimate import row_blocks
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes, place_columns
+from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows, NewDate
+from diffeo_calib.kinematics.re_registration.register_again import MARKER_DEVIATIONS
 from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_rows, typical_noise
-from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
-from diffeo_calib.maps.observation import Observation
+from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
@@ -51,146 +48,77 @@ NOISE_EFOLDS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class NewRows:
+class NewRows(NewDate):
     """Rows of a new set-up, brought into the frame of the old model.
 
     Args:
-        before: the old map, and where devices and markers are.
-        q: (M, n) configurations. y: (M, R) measured numbers, m; as predicted where markers are hidden.
-        noise_model: how they were measured.
-        points: the nominal map of the registered markers, under the payloads of the rows.
-        noise: (M, R, R) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
-        tails: weights of the rows.
-        observe: what was measured of the markers; their coordinates by default.
+        before: the old map, and where devices and markers are. noise_model: how the rows were measured.
+        marker: which the markers are, see MARKER_DEVIATIONS. tails: weights of the rows.
         placement: devices that stand around the old model; what is not known of them, rows share.
+        drifts: (M R, c) columns of unit variance of what has changed in the robot since, m.
     """
 
     before: Before
-    q: Tensor
-    y: Tensor
     noise_model: NoiseModel
-    points: FlangePoints
-    noise: Tensor
-    marker_deviation: float
+    marker: str
     tails: Tails
-    observe: Observation | None = None
-    placement: Placement = Placement()  # noqa: RUF009  # frozen
+    placement: Placement
+    drifts: Tensor | None = None
 
     @classmethod
-    def of(cls, before: Before, markers: Tensor, marker_deviation: float) -> NewRows:
+    def of(cls, before: Before, markers: Tensor, marker: str) -> NewRows:
         """The rows with the noise of a typical old row, or their own where it is larger, all weights 1.
 
         Args:
-            before: see the class. markers: (P, 3) near which they are, in the frames of their tips, m.
-            marker_deviation: see the class.
+            before, marker: see the class. markers: (P, 3) near which they are, in the frames of their tips, m.
         """
         points = FlangePoints(before.nominal.under(before.data.payload), markers, same=True)
         seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
         model, noise, known = _measured(before, seen)
-        tails = Tails.none(len(seen), model.bodies, device=seen.device)
-        return cls(
-            before,
+        frame = seen.new_full((6,), 0.0 if before.place is None else PLACES.found_m_rad)
+        moved = MARKER_DEVIATIONS[marker][1] * before.seen_before.repeat_interleave(3).to(frame)
+        rows = cls(
+            before.fitted,
+            points,
             before.data.q,
-            noise_model=model,
-            points=points,
             noise=noise,
-            marker_deviation=marker_deviation,
-            tails=tails,
+            visible=model.coordinates(known["y"]),
+            shared=noise[..., :0],
+            deviations=torch.cat([frame, moved]),
+            centre=seen.view(-1, 3).mean(0),
+            before=before,
+            noise_model=model,
+            marker=marker,
+            tails=Tails.none(len(seen), model.bodies, device=seen.device),
             **known,
         )
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    @property
-    def fitted(self) -> FittedMap:
-        """The old map."""
-        return self.before.fitted
-
-    @cached_property
-    def seen(self) -> tuple[Tensor, Linearisation]:
-        """The points (M, 3 P) by the old model, m, and their linearisation."""
-        return self.fitted.geodesic.with_nominal(self.points).linearised_value(self.q)
-
-    @cached_property
-    def slopes(self) -> Tensor | None:
-        """(M, R, 3 P) of what was measured; None for all coordinates."""
-        return None if self.observe is None else self.observe.slope(self.seen[0]).detach()
-
-    @cached_property
-    def at(self) -> Linearisation:
-        """Linearised prediction of the old model for the measured numbers."""
-        return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
-
-    @cached_property
-    def residual(self) -> Tensor:
-        """(M, R) measured minus predicted, m."""
-        return self.y - (self.seen[0] if self.observe is None else self.observe.value(self.seen[0]))
-
-    @cached_property
-    def centre(self) -> Tensor:
-        """(3,) the middle of the rows, m."""
-        return self.seen[0].unflatten(1, (-1, 3)).flatten(0, 1).mean(0)
+        by_tool = torch.nn.functional.pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
+        shared = rows.placement.shared(SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool))
+        return rows if shared is None else rows.changed(shared=shared)
 
     @cached_property
     def shifts(self) -> Tensor:
         """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
-        deformation = self.fitted.geodesic.with_nominal(self.points)
-        places, free = self.seen[0].unflatten(1, (-1, 3)), self.marker_deviations
-        found = place_columns(deformation, self.seen[1], places, self.centre, frame=self.frame_deviation, free=free)
-        return torch.cat([found if self.slopes is None else self.slopes @ found, self.by_devices], 2)
-
-    @property
-    def frame_deviation(self) -> float:
-        """Prior deviation of the measuring frame, m and rad: it may have moved where a device measured coordinates."""
-        return 0.0 if self.before.place is None else PLACES.found_m_rad
-
-    @property
-    def marker_deviations(self) -> Tensor:
-        """(3 P,) those of the markers, m: of those that old and new rows show."""
-        return self.marker_deviation * self.before.seen_before.repeat_interleave(3).to(self.y)
+        return torch.cat([(self.by_places * self.deviations)[..., self.deviations > 0], self.shared], 2)
 
     @cached_property
-    def by_devices(self) -> Tensor:
-        """(M, R, c) effect of the devices that stand around the old model."""
-        tool = self.before.nominal.geometry.slices["tool"]
-        S = marker_slopes(self.fitted.geodesic, self.points, self.seen[1])
-        S = torch.nn.functional.pad(S if self.slopes is None else self.slopes @ S, (tool.start, 0))
-        shown = SeenRows(self.before.nominal, self.y, self.seen[0], self.slopes, S)
-        found = self.placement.shared(shown)
-        return self.y.new_zeros(*self.y.shape, 0) if found is None else found
+    def given(self) -> LinearRows:
+        """The rows to first order, with their weights."""
+        k, C = self.shifts.shape[2], self.fit_covariance
+        C = C if self.drifts is None else C + self.drifts @ self.drifts.T
+        none, prior = C.new_zeros(k, k), torch.eye(k, dtype=C.dtype, device=C.device)
+        return LinearRows(self.residual, self.shifts, C, self.weighted_noise, self.visible, prior, none.sum(0), none)
 
-    @cached_property
+    @property
     def posterior(self) -> Tensor:
-        """(M R, M R) covariance of the old model at the rows, devices and markers free, m^2."""
-        flat = self.shifts.flatten(0, 1)
-        total = self.fitted.covariance_between(self.at) + flat @ flat.T
+        """(M R, M R) covariance of the rows without noise, devices and markers free, m^2."""
+        total = self.given.C + self.given.slopes @ self.given.slopes.T
         return 0.5 * (total + total.T)
 
     @property
     def weighted_noise(self) -> Tensor:
         """(M, m, m) covariance of the rows with their weights, m^2."""
         return self.noise_model.weighted(self.noise, self.tails)
-
-    @cached_property
-    def factor(self) -> Tensor:
-        """Cholesky factor of the covariance (M m, M m) of the residuals."""
-        return torch.linalg.cholesky(Noise(self.weighted_noise).add_to(self.posterior))
-
-    @cached_property
-    def solved(self) -> Tensor:
-        """(M, m, 1) covariance^-1 r."""
-        return torch.cholesky_solve(self.residual.reshape(-1, 1), self.factor).view(*self.y.shape, 1)
-
-    @cached_property
-    def precisions(self) -> Tensor:
-        """(M, m, m) blocks of covariance^-1: of each row's error as the old model and all other rows predict it."""
-        return row_blocks(torch.cholesky_inverse(self.factor), len(self))
-
-    @property
-    def log_evidence(self) -> float:
-        """log N(r; 0, covariance), but for a constant."""
-        return float(-0.5 * (self.residual * self.solved[..., 0]).sum() - self.factor.diagonal().log().sum())
 
     def with_weights(self) -> NewRows:
         """The same rows with the weights of Student's t, by expectation maximisation."""
@@ -207,41 +135,26 @@ class NewRows:
         """Some of the rows."""
         if len(index) == len(self):
             return self
-        own = {"q": self.q[index], "y": self.y[index], "noise_model": self.noise_model.rows(index)}
-        observe = None if self.observe is None else self.observe.rows(index)
-        other = replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index), observe=observe)
+        own: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "visible", "shared")}
+        own |= {"noise_model": self.noise_model.rows(index), "tails": self.tails.rows(index)}
+        other = replace(self, **own, observe=None if self.observe is None else self.observe.rows(index))
         points, at = self.seen
-        vars(other).update(seen=(points[index], at.rows(index)), shifts=self.shifts[index])
+        vars(other).update(seen=(points[index], at.rows(index)), by_places=self.by_places[index])
         return other
 
-    def if_drifting(self, roots: list[Tensor]) -> NewRows:
-        """The rows where parts with these covariances drift, with weights that hold then: a change is no outlier.
+    def drifting(self, roots: Sequence[Tensor]) -> NewRows:
+        """The rows where parts with these columns (M, R, c) of their covariance drift, m."""
+        own = [] if self.drifts is None else [self.drifts]
+        return self.changed(drifts=torch.cat([*own, *(root.flatten(0, 1) for root in roots)], 1)) if roots else self
 
-        Args:
-            roots: (M, m, c) columns of each part's covariance, m.
-        """
-        together = torch.cat(roots, 2).flatten(0, 1)
-        return self.with_posterior(self.posterior + together @ together.T).with_weights()
+    def evidence(self, root: Tensor) -> Evidence:
+        """Of unknowns with these effects (M, R, c)."""
+        E = root.flatten(0, 1)
+        return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
 
-    def with_posterior(self, posterior: Tensor) -> NewRows:
-        """The same rows with another covariance (M m, M m) without noise, m^2."""
-        other = self.changed()
-        vars(other)["posterior"] = posterior
-        return other
-
-    def changed(self, **changes: object) -> NewRows:
-        """The same rows with other noise, weights or deviation of the markers; what does not change is kept."""
-        other = replace(self, **changes)
-        keep = ["seen", "slopes", "at", "residual", "centre", "by_devices"]
-        keep += [] if "marker_deviation" in changes else ["shifts", "posterior"]
-        vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
-        return other
-
-    @property
-    def left_out(self) -> Tensor:
-        """(M, m) how far each row is from its prediction by the old model and the other rows, m; NaN where hidden."""
-        errors = torch.linalg.solve(self.precisions, self.solved)[..., 0]
-        return errors.masked_fill(~self.noise_model.coordinates(errors), nan)
+    def if_drifting(self, roots: Sequence[Tensor]) -> NewRows:
+        """The same with weights that hold then: a change is no outlier."""
+        return self.drifting(roots).with_weights()
 
     @property
     def new_noise(self) -> Tensor:
@@ -252,13 +165,8 @@ class NewRows:
         old = self.fitted.new_noise
         if self.observe is not None or self.fitted.slopes is not None:
             return old
-        found = self._mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        found = self.mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
         return found if float(found.trace()) > float(old.trace()) else old
-
-    @property
-    def _mean_noise(self) -> Tensor:
-        """(R, R) the mean of the rows' noise, m^2."""
-        return mean_block(self.noise, self.noise_model.coordinates(self.y))
 
     @property
     def inflation(self) -> float:
@@ -267,45 +175,30 @@ class NewRows:
         The scales were chosen for another session, with few rows of other places, temperatures or loads. The errors of
         every new row as predicted by the old model and all others judge them, see :func:`region_scale`.
         """
-        covariance, noise = torch.linalg.inv(self.precisions), self.noise
-        error = covariance @ self.solved
+        covariance, noise = torch.linalg.inv(self.given.precisions), self.noise
+        error = covariance @ self.given.solved[..., None]
         if self.observe is None and self.fitted.slopes is None:
-            noise = noise * (self.new_noise.trace() / self._mean_noise.trace())
+            noise = noise * (self.new_noise.trace() / self.mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
         return max(1.0, region_scale(squares, self.noise_model.freedom, prior=OTHER_DATE))
 
     def _expected_squares(self) -> Tensor:
         """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
-        noise = self.weighted_noise
-        error = noise @ self.solved
-        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ self.precisions @ noise)
-
-    @cached_property
-    def after_placing(self) -> Tensor:
-        """(M R, M R) what becomes of errors once devices and markers are where the rows fit best.
-
-        They are weighed by the noise alone, as in a registration: weights by the covariance of the model would leave
-        centimetres in the rows where the model is uncertain by as much, although another place explains them.
-        """
-        flat = self.shifts.flatten(0, 1)
-        weighted = torch.linalg.solve(self.weighted_noise, self.shifts).flatten(0, 1)
-        eye = torch.eye(flat.shape[1], dtype=flat.dtype, device=flat.device)
-        gain = torch.linalg.solve(eye + flat.T @ weighted, weighted.T)
-        return torch.eye(len(flat), dtype=flat.dtype, device=flat.device) - flat @ gain
+        noise, given = self.weighted_noise, self.given
+        error = noise @ given.solved[..., None]
+        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ given.precisions @ noise)
 
     @property
     def placed_residual(self) -> Tensor:
         """(M, R) residuals with devices and markers where the rows put them, m; NaN where hidden."""
-        left = (self.after_placing @ self.residual.flatten()).view(self.y.shape)
-        return left.masked_fill(~self.noise_model.coordinates(left), nan)
+        return self.given.shown(self.given.after_placing @ self.given.target)
 
     @property
     def expected_residual(self) -> Tensor:
         """(M, R) standard deviations of these that model and noise lead to expect, m; NaN where hidden."""
-        flat = self.shifts.flatten(0, 1)
-        total = Noise(self.noise).add_to(self.posterior - flat @ flat.T)
-        variances = ((self.after_placing @ total) * self.after_placing).sum(1).clamp(min=0.0)
-        return variances.sqrt().view(self.y.shape).masked_fill(~self.noise_model.coordinates(self.y), nan)
+        placed = self.given.after_placing
+        variances = ((placed @ Noise(self.noise).add_to(self.given.C)) * placed).sum(1).clamp(min=0.0)
+        return self.given.shown(variances.sqrt())
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
@@ -315,8 +208,7 @@ class NewRows:
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        squares = (self.solved.mT @ torch.linalg.solve(self.precisions, self.solved)).flatten()
-        squares = squares / self.noise_model.coordinates(self.y).sum(1)
+        squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
         return float(squares.median().sqrt())
 
     def levelled(self, roots: list[Tensor]) -> NewRows:
@@ -327,15 +219,14 @@ class NewRows:
         """
         kinds = self.noise_model.kinds
         kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
-        together = torch.cat(roots, 2).flatten(0, 1) if roots else self.y.new_zeros(self.y.numel(), 0)
-        rows = self.with_posterior(self.posterior + together @ together.T)
+        rows = self.drifting(roots)
         for kind in range(int(self.fitted.slopes is None), int(kinds.max()) + 1):
             own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1)
-            own = own & self.noise_model.coordinates(self.y)
+            own = own & self.visible
             levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
             prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
-            logs = [each.with_posterior(rows.posterior).log_evidence + p for each, p in zip(levels, prior, strict=True)]
-            rows = levels[logs.index(max(logs))].with_posterior(rows.posterior)
+            logs = [each.given.log_evidence() + p for each, p in zip(levels, prior, strict=True)]
+            rows = levels[logs.index(max(logs))]
         return self.changed(noise=rows.noise)
 
 
@@ -351,12 +242,11 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     if before.coordinates is not None:
         told, noise, sets = _coordinates(before, *before.coordinates, seen)
     sets += before.sessions
-    points, readings = seen.unflatten(1, (-1, 3)), list[ReadingDevices]()
-    for table, own in before.readings:
-        numbers = torch.arange(table.values.shape[1], device=own.device)
-        readings.append(ReadingDevices(table, fitting_devices(table, points[own]), own, numbers))
+    points = seen.unflatten(1, (-1, 3))
+    devices = [fitting_devices(table, points[own]) for table, own in before.readings]
+    readings = reading_sets(before.readings, devices)
     if told is not None and noise is not None and len(told.rows) == len(seen):
-        return told.noise_model, noise, {"y": told.y, "placement": Placement(sets)}
+        return told.noise_model, noise, {"y": told.y, "observe": None, "placement": Placement(sets)}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
     old = before.fitted.noise

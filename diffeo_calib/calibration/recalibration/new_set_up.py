@@ -24,7 +24,8 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
+from diffeo_calib.kinematics.re_registration.linear_rows import NewDate
+from diffeo_calib.kinematics.re_registration.register_again import MARKER_DEVIATIONS, FoundPlace, find_place, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -137,7 +138,9 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         own = own._replace(table=mounted_of(model).in_any_frame(table))
         device = measured_rows(own.table)
         if device is not None:
-            place, seen = _place_of_device(old, nominal, model.lever, device.table, REGISTERED_M.get(marker))
+            # the rows judge "same", too
+            stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
+            place, seen = _place_of_device(old, nominal, model.lever, device.table, stated)
             geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
             geometry = replace(geometry, base=place.registration.transform @ geometry.base)
             sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
@@ -174,6 +177,7 @@ def _place_of_device(
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest, marker_std=marker_std)
+    warn_of_scale(place.best.date)
     turn, T = float(place.registration.frame_deviations[3:].max()), place.registration.transform
     if turn > LARGEST_TURN_RAD:
         raise MeasurementError.of(
@@ -220,13 +224,13 @@ def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None
 
 
 Marker = Literal["evidence", "same", "moved", "other"]
-REGISTERED_M: dict[str, float] = {"moved": PLACES.remounted_m, "other": PLACES.other_registered_m}
-"""Prior standard deviations of the markers in the registration, m. Else the rows choose: they judge "same", too."""
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
 LARGEST_RATIO, OTHER_UNIT = 5.0, 0.5
 """Ratio of measured and predicted distances that is doubted, and its relative error from which it is no unit's: markers
 may be others."""
+USUAL_RATIO = 3e-3
+"""Relative error of distances that no robot has."""
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
 UNLIKELY = 0.01
@@ -282,8 +286,21 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
 
 
-def warn_of_moved_markers(found: Registration, marker: str) -> None:
-    """Warn if the markers are said to be the same, and the rows say otherwise."""
+def warn_of_scale(rows: NewDate) -> None:
+    """Warn if distances between points that a device measured differ by a factor that no robot has."""
+    measured = rows.y.masked_fill(~rows.visible, nan)
+    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], measured)))
+    if abs(ratio - 1.0) > USUAL_RATIO:
+        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
+        warn_user(sentence(what, fix="check the scale of the measuring device"))
+
+
+def warn_of_places(before: Before, marker: str, *, outliers: bool, excess: bool) -> None:
+    """Warn of what a registration found, see :func:`warn_about`, and of markers that are said to be the same."""
+    found = before.registration
+    if found is None:
+        return
+    warn_about(found, outliers=outliers, excess=excess)
     if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
         what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
         warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))

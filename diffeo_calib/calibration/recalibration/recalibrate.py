@@ -30,8 +30,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     check_other_table,
     knows_ball,
     place_again,
-    size_ratio,
-    warn_of_moved_markers,
+    warn_of_places,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
 from diffeo_calib.calibration.recalibration.usual_drift import usual_drift
@@ -44,25 +43,20 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates
+from diffeo_calib.kinematics.re_registration.both_dates import both_dates
 from diffeo_calib.kinematics.re_registration.register_again import (
+    MARKER_DEVIATIONS,
     UNMOVED_LOG_ODDS,
     carried_devices,
     devices_beside,
-    warn_about,
 )
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import mounted_of
 
 LOG = logging.getLogger(__name__)
-MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
-"""Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
-REGISTERED_AS = {PLACES.same_registered_m: "same", PLACES.remounted_m: "moved", PLACES.other_registered_m: "other"}
-"""The same in a registration."""
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
 Drift = Literal["tested", "none"]
@@ -177,16 +171,12 @@ def recalibrate(
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
     LOG.info("changes: %s", changes)
     warn_of_groups(changes)
-    found = before.registration
-    if found is not None:
-        warn_about(found, outliers=False, excess=not drifts)
-        warn_of_moved_markers(found, marker)
-    warn_of_scale(rows)
+    warn_of_places(before, marker, outliers=False, excess=not drifts)
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
         rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
-    warn_of_contradictions(rows, rows.excess if found is None else found.excess)
+    warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)
     fitted = fit_both(rows, drifts, progress)
     if fitted.solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum: nothing is worth keeping
@@ -195,27 +185,12 @@ def recalibrate(
 
 def fit_both(rows: NewRows, drifts: list[PartDrift], progress: Progress) -> Fit:
     """The exact model of old and new rows with the old scales."""
-    before, old = rows.before, rows.fitted
-    drifted = list[Tensor]()
+    old, drifted = rows.fitted, list[Tensor]()
     if drifts:
         at = old.geodesic.linearise(None if old.data is None else old.x)
         at = at if old.slopes is None else at.projected(old.slopes)
         drifted = [each.variance**0.5 * each.part.root(at) for each in drifts]
-    new = NewDate(
-        markers=rows.points.points,
-        payload=rows.points.fitted.payload,
-        q=rows.q,
-        y=rows.y,
-        noise=rows.weighted_noise,
-        seen=rows.noise_model.coordinates(rows.y),
-        shared=rows.by_devices,
-        new_noise=rows.new_noise,
-        frame=rows.frame_deviation,
-        free=rows.marker_deviations,
-        centre=rows.centre,
-        observe=rows.observe,
-    )
-    problem, start = both_dates(old, before.nominal, new, drifted, rows.inflation)
+    problem, start = both_dates(rows.before.nominal, rows, rows.new_noise, drifted, rows.inflation)
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
 
@@ -235,7 +210,7 @@ def _result(
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
     again.placement = _with_settled(devices_beside(again, new), model, place, rows, fitted)
-    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.left_out))
+    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.given.left_out))
     if model.summary is not None:
         known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
         certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
@@ -248,7 +223,7 @@ def _result(
         model=again,
         moved=found,
         placement=rows.placement,
-        marker=next(name for name, deviation in MARKER_DEVIATIONS.items() if deviation == rows.marker_deviation),
+        marker=rows.marker,
         changes=changes,
         tails=rows.tails,
         outliers=tuple(new.line_numbers[small.to(HOST)].tolist()),
@@ -284,7 +259,7 @@ def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
     shared = fitted.problem.noise.shared[-len(rows) :]
     left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
-    return left.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
+    return left.masked_fill(~rows.visible, nan)
 
 
 def weighed(before: Before, marker: str) -> NewRows:
@@ -301,15 +276,15 @@ def weighed(before: Before, marker: str) -> NewRows:
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
     if place is not None:
-        name = REGISTERED_AS[place.best.metres]
+        name = next(name for name, (first, _) in MARKER_DEVIATIONS.items() if first == place.best.metres)
         return _rows(before, places[name], name).with_weights()
     every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
-    return max(every.items(), key=lambda each: each[1].log_evidence + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
+    return max(every.items(), key=lambda each: each[1].given.log_evidence() + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
 
 
 def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
     """The new rows with all weights 1, the markers near these places (P, 3)."""
-    rows = NewRows.of(before, markers, MARKER_DEVIATIONS[marker])
+    rows = NewRows.of(before, markers, marker)
     if rows.observe is None and before.fitted.slopes is None:
         return rows
     return rows.levelled([part.root(rows.at) for part in parts_of(rows)])
@@ -319,20 +294,6 @@ LARGEST_OUTLIER_PART = 0.5
 """Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
 LARGEST_EXCESS = 10.0
 """Residuals by this factor above the expected ones are not those of a worn joint."""
-USUAL_RATIO = 3e-3
-"""Relative error of distances that no robot has."""
-
-
-def warn_of_scale(rows: NewRows) -> None:
-    """Warn if distances between measured points differ by a factor that no robot has."""
-    if rows.before.place is None or rows.observe is not None:
-        return
-    seen = rows.y.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
-    predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
-    ratio = size_ratio(predicted, measured)
-    if abs(ratio - 1.0) > USUAL_RATIO:
-        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
-        warn_user(sentence(what, fix="check the scale of the measuring device"))
 
 
 def warn_of_groups(changes: Changes) -> None:

@@ -13,11 +13,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.recalibration.changed_parts import ChangedPart, parts_of
 from diffeo_calib.calibration.recalibration.changes import Drift
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.maps.noise import Noise
 
 USUAL_LOG, EFOLDS = -6.0, 2.5
 """Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
@@ -41,38 +39,30 @@ def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
         return []
     roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
     known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
-    doubted = rows.if_drifting([*known, *roots])
-    base = rows.posterior if not known else rows.if_drifting(known).posterior
-    residual, columns, sizes = rows.residual.flatten(), [root.flatten(0, 1) for root in roots], None
+    doubted, sizes = rows.if_drifting([*known, *roots]), list[float]()
     for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
-        sizes, odds = _likeliest(Noise(weighed.weighted_noise).add_to(base), columns, residual)
+        sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
         if odds < least:
             return []
-    return [Drift(part, size) for parts, size in zip(groups.values(), sizes or [], strict=True) for part in parts]
+    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
 
 
-def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> tuple[list[float], float]:
-    """The sizes s^2 of changes with these columns (M R, c), each in turn the likeliest beside the others; log odds.
+def _likeliest(rows: NewRows, roots: list[Tensor]) -> tuple[list[float], float]:
+    """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
+    sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
+    prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()
 
-    Args:
-        covariance: (M R, M R) without these changes, m^2. residual: (M R,), m.
-    """
-    sizes, chosen = LOG_SIZES.exp().to(covariance), [0] * len(roots)
-    prior = -0.5 * ((LOG_SIZES.to(covariance) - USUAL_LOG) / EFOLDS).square()
-
-    def scaled(kept: Sequence[int]) -> Tensor:
-        return torch.cat([covariance[:, :0], *(sizes[chosen[k]].sqrt() * roots[k] for k in kept)], 1)
-
-    def evidence(columns: Tensor, beside: Tensor) -> Evidence:
-        return Evidence.by(columns, residual, torch.linalg.cholesky(covariance + beside @ beside.T))
+    def scaled(k: int) -> Tensor:
+        return sizes[chosen[k]].sqrt() * roots[k]
 
     every = range(len(roots))
     for _ in range(ROUNDS):
         before = list(chosen)
         for k in every:
-            beside = scaled([j for j in every if j != k])
-            chosen[k] = int((evidence(roots[k], beside).log_odds(sizes) + prior).argmax())
+            beside = rows.drifting([scaled(j) for j in every if j != k])
+            chosen[k] = int((beside.evidence(roots[k]).log_odds(sizes) + prior).argmax())
         if chosen == before:
             break
-    odds = evidence(scaled(every), covariance[:, :0]).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
+    together = torch.cat([scaled(k) for k in every], 2)
+    odds = rows.evidence(together).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
     return sizes[chosen].tolist(), float(odds)

@@ -7,8 +7,6 @@ The old rows follow from the old momenta (:meth:`FittedMap.measured`), from whic
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -16,40 +14,14 @@ from torch.nn.functional import pad
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.registered_map import place_columns
+from diffeo_calib.kinematics.re_registration.linear_rows import NewDate
+from diffeo_calib.kinematics.re_registration.registered_map import place_slopes
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.regression.choose import MAX_DENSE
-from diffeo_calib.robots.payload import Payload, joined_masses
+from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
-
-
-class NewDate(NamedTuple):
-    """M rows of a new set-up in the frame of the fit.
-
-    Args:
-        markers: (P, 3) where they are now, in the frames of their tips, m. payload: of the rows.
-        q: (M, n). y: (M, R) measured numbers, m; any where hidden. noise: (M, R, R) m^2. seen: (M, R) boolean.
-        shared: (M, R, c) effects of errors of unit variance that they share, m.
-        new_noise: (m, m) of a new measurement, m^2.
-        frame: prior deviation of the device's frame, m and rad; 0 where it has not moved. free: (3 P,) those of the
-            markers' coordinates, m. centre: (3,) about which the frame turns, m.
-        observe: what was measured of the markers; their coordinates by default.
-    """
-
-    markers: Tensor
-    payload: Payload | None
-    q: Tensor
-    y: Tensor
-    noise: Tensor
-    seen: Tensor
-    shared: Tensor
-    new_noise: Tensor
-    frame: float
-    free: Tensor
-    centre: Tensor
-    observe: Observation | None = None
 
 
 def joins(old: FittedMap, count: int) -> bool:
@@ -59,23 +31,24 @@ def joins(old: FittedMap, count: int) -> bool:
 
 
 def both_dates(
-    old: FittedMap, nominal: GeometryMap, new: NewDate, drifted: list[Tensor], factor: float
+    nominal: GeometryMap, new: NewDate, new_noise: Tensor, drifted: list[Tensor], factor: float
 ) -> tuple[Problem, Momenta]:
     """The problem of old and new rows, and the old momenta as its start.
 
     Args:
-        old: the fit. nominal: its nominal map. new: the rows.
+        nominal: that of the fit. new: the rows. new_noise: (m, m) of a new measurement, m^2.
         drifted: (N, r, c) columns of what the old rows share besides places, m.
         factor: on all variances, which changes the uncertainty, but not the optimum.
     """
+    old = new.fitted
     spec, theta, x = old.geodesic.spec, old.deformation.momenta.theta, old.deformation.x
     geometry, count = nominal.geometry, len(new.q)
-    newest = nominal.with_geometry(geometry.with_tool(new.markers - theta[geometry.slices["tool"]].view(-1, 3)))
+    newest = nominal.with_geometry(geometry.with_tool(new.points.points - theta[geometry.slices["tool"]].view(-1, 3)))
     prior = spec.prior_variance.clone()
-    if new.frame > 0:  # a device says where the base is
+    if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
-    y, noise, observe = _together(old, new)
-    before, rows = _shared(old, nominal, new, drifted), y.shape[1]
+    y, noise, observe = _together(new)
+    before, rows = _shared(nominal, new, drifted), y.shape[1]
     before = pad(before, (0, new.shared.shape[2], 0, rows - before.shape[1]))
     since = pad(new.shared, (before.shape[2] - new.shared.shape[2], 0, 0, rows - new.shared.shape[1]))
     problem = Problem(
@@ -87,10 +60,10 @@ def both_dates(
         noise=Noise(factor * noise, factor**0.5 * torch.cat([before, since])),
         markers=geometry.markers,
         prior_variance=factor * prior,
-        new_noise=factor * new.new_noise,
+        new_noise=factor * new_noise,
         observe=observe,
     )
-    problem = problem.with_nominal_of_rows(_sessions(old, geometry.tool, new, newest))
+    problem = problem.with_nominal_of_rows(_sessions(geometry.tool, new, newest))
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([x, new.q]))
     b, p, _ = old.deformation.momenta.tensors
@@ -98,13 +71,14 @@ def both_dates(
     return problem, Momenta(b, p, theta)
 
 
-def _together(old: FittedMap, new: NewDate) -> tuple[Tensor, Tensor, Observation | None]:
+def _together(new: NewDate) -> tuple[Tensor, Tensor, Observation | None]:
     """Numbers (N + M, R), m, their noise (N + M, R, R), and what they are of the points.
 
     Old rows are what was measured of k1 to first order around the fit; the old fit's own numbers if it knows.
     """
+    old, own_noise = new.fitted, new.weighted_noise
     if old.slopes is None and new.observe is None:
-        return torch.cat([old.measured(), new.y]), torch.cat([old.noise.covariance, new.noise]), None
+        return torch.cat([old.measured(), new.y]), torch.cat([old.noise.covariance, own_noise]), None
     A, y = old.linearised_rows()
     (N, r, m), (M, own) = A.shape, new.y.shape
     size, whole = max(r, own), torch.arange(m, device=y.device)
@@ -114,8 +88,8 @@ def _together(old: FittedMap, new: NewDate) -> tuple[Tensor, Tensor, Observation
     else:
         eye = torch.eye(own, dtype=y.dtype, device=y.device).expand(M, -1, -1)
         parts.append(Part(torch.arange(N, N + M, device=y.device), whole[:own], whole[:own], _linear(eye)))
-    noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, new.noise)]
-    seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.seen)])
+    noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, own_noise)]
+    seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
     numbers = torch.cat([pad(values, (0, size - values.shape[1])) for values in (y, new.y)])
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
@@ -124,22 +98,23 @@ def _linear(A: Tensor) -> LinearFunctionals:
     return LinearFunctionals(A, A.new_zeros(A.shape[:2]))
 
 
-def _shared(old: FittedMap, nominal: GeometryMap, new: NewDate, drifted: list[Tensor]) -> Tensor:
+def _shared(nominal: GeometryMap, new: NewDate, drifted: list[Tensor]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
+    old = new.fitted
     deformation = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
     places = old.measured() if old.slopes is None else old.fitted_points
     at = deformation.linearise(old.x)
-    moved = place_columns(deformation, at, places.unflatten(1, (-1, 3)), new.centre, frame=new.frame, free=new.free)
+    moved = (place_slopes(deformation, at, places, new.centre) * new.deviations)[..., new.deviations > 0]
     return torch.cat([old.noise.shared, moved if old.slopes is None else old.slopes @ moved, *drifted], 2)
 
 
-def _sessions(old: FittedMap, tool: Tensor, new: NewDate, newest: GeometryMap) -> SessionMarkers:
+def _sessions(tool: Tensor, new: NewDate, newest: GeometryMap) -> SessionMarkers:
     """k0 at the controls: every session with its own markers, every row with its own payload."""
-    by_row, x = old.geodesic.spec.at_controls, old.deformation.x
+    by_row, x = new.fitted.geodesic.spec.at_controls, new.fitted.deformation.x
     session, tools = torch.zeros(len(x), dtype=torch.int64, device=x.device), tool[None]
     if isinstance(by_row, SessionMarkers):
         session, tools, by_row = by_row.session, by_row.tools, by_row.nominal
     latest = torch.full((len(new.q),), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.under(joined_masses(by_row.payload, new.payload))
+        newest = newest.under(joined_masses(by_row.payload, new.points.fitted.payload))
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))

@@ -1,28 +1,16 @@
 """Find where the measuring device stands and where the markers sit, from a few rows and a calibrated model.
 
 With everything else kept, the rows y_i see the model through a small motion D(u) of the measuring frame and of the
-markers, after a start in closed form (robots/placement.py):
+markers, after a start in closed form (robots/placement.py): T^-1 y_i - k1(q_i; m) are the residuals of linear_rows.py.
 
-    T^-1 y_i - k1(q_i; m) = S_i u + e_i + noise_i,    cov(e_i, e_j) = C(q_i, q_j),
-
-C the posterior covariance of the fit, R that of the noise, V = C + R. With a prior N(mu, P) of u,
-
-    u = mu + A (r - S mu),    A = ((P + B)^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
-
-B is the covariance of the markers' old places by the fit, a part of C: where the fit hardly knew a marker, as along the
-axis of a tool that was never tilted, the rows place it, though it stayed; or zero. Errors of rows left out choose. R in
-place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors are not
-correlated as C says, and weights by V do harm: on another series of a UR10 more rows hurt. The covariance U, the test
-for outliers and the marginal likelihood take all of V.
-
-Leaving rows J out lowers the quadratic form of the residuals by mu_J^T (K^-1)_JJ^-1 mu_J with K = V + S P S^T and
-mu = K^-1 (r - S mu). Compared with what remains, this is an F test (externally studentised residuals), so that an
-outlier does not hide itself. Single rows are tried first, then pairs, which may hide each other.
+Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
+test (externally studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then
+pairs, which may hide each other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
 
@@ -30,14 +18,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.kinematics.re_registration.session import Place
+from diffeo_calib.kinematics.nominal import FlangePoints
+from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows, NewDate
+from diffeo_calib.kinematics.re_registration.session import Session
 from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.regression.factor import Factor
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import rotation, transforms
 
 MAX_STEPS = 100
+SMALL_STEP = 1e-2
+"""Below such a step of the markers, m, C hardly changes."""
 SETTLED = 1e-9
 """The iteration ends with a step below this, m and rad."""
 PRIOR_FREEDOM = 10.0
@@ -49,131 +41,83 @@ MOST_PAIRS = 800
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The best place under one prior, and what the rows say about it.
+    """A frame T (4, 4), m, and markers on their tips, and what the rows say from there.
 
     Args:
-        place: where rows, frame and body are linearised. metres: prior deviation of the body from its old place, m.
-        opened: whether B is the covariance of that place by the fit, or zero.
+        metres: prior deviation of the markers from their old places. date: the rows, seen from there.
     """
 
-    place: Place
+    session: Session
     metres: float
-    opened: bool
+    T: Tensor
+    date: NewDate
+
+    @classmethod
+    def at(cls, session: Session, metres: float, T: Tensor, markers: Tensor) -> Estimate:
+        """With the markers (P, 3) there, m."""
+        visible, free = measured_coordinates(session.noise), session.free
+        date = NewDate(
+            fitted=session.fitted,
+            points=FlangePoints(session.nominal, markers, same=session.same),
+            q=session.data.q,
+            y=session.seen(T).flatten(1).nan_to_num(0.0),
+            noise=session.noise,
+            visible=visible,
+            shared=session.shared,
+            deviations=free * markers.new_tensor([PLACES.sought_base_m_rad] * 6 + [metres] * (len(free) - 6)),
+            centre=session.centre,
+            observe=None,
+        )
+        return cls(session, metres, T, date)
 
     @property
-    def residual(self) -> Tensor:
-        """(M, m) r."""
-        return self.place.residual
+    def markers(self) -> Tensor:
+        """(P, 3) m."""
+        return self.date.points.points
 
-    @cached_property
-    def visible(self) -> Tensor:
-        """(M, m) boolean: the coordinates that were measured."""
-        return measured_coordinates(self.place.session.noise)
+    def settled(self, metres: float) -> Estimate:
+        """The best one under a prior, by Gauss-Newton."""
+        found, centre = Estimate.at(self.session, metres, self.T, self.markers), self.session.centre
+        found = replace(found, date=self.date.changed(deviations=found.date.deviations))
+        for _ in range(MAX_STEPS):
+            step = centre.new_zeros(len(self.session.free)).index_copy(0, self.free, found.rows.step)
+            if float(step.abs().max()) < SETTLED:
+                break
+            turn, before = rotation(step[3:6]), found.date
+            T = found.T @ transforms(turn, centre + step[:3] - turn @ centre)
+            found = Estimate.at(self.session, metres, T, found.markers + step[6:].view(-1, 3))
+            if float(step[6:].abs().max()) < SMALL_STEP:
+                vars(found.date)["fit_covariance"] = before.fit_covariance
+        return found
 
     @cached_property
     def free(self) -> Tensor:
-        """(f,) numbers of the unknowns that are free."""
-        return self.place.session.free.nonzero()[:, 0]
+        """(k,) numbers of the unknowns that are free."""
+        return self.session.free.nonzero()[:, 0]
 
     @cached_property
-    def S(self) -> Tensor:
-        """(M, m, f) by the free unknowns."""
-        return self.place.by_unknowns[..., self.free]
-
-    @cached_property
-    def V(self) -> Tensor:
-        """(M m, M m), with what is not free as an earlier registration knows it."""
-        own = self.place.session
-        Z = own.shared.flatten(0, 1)
-        held = self.place.by_unknowns.flatten(0, 1) * ~own.free
-        V = self.place.C + torch.block_diag(*own.noise) + Z @ Z.mT + held @ own.earlier @ held.mT
-        return 0.5 * (V + V.mT)
-
-    @cached_property
-    def mean(self) -> Tensor:
-        """(f,) mu."""
-        back = self.place.body.from_old
-        return torch.cat([back.new_zeros(6), -back])[self.free]
-
-    @cached_property
-    def prior(self) -> Tensor:
-        """(f, f) P."""
-        wide = self.V.new_full((6,), PLACES.sought_base_m_rad)
-        deviations = torch.cat([wide, self.place.body.deviations(self.metres)])
-        whole = self.place.session.earlier + torch.diag(deviations.square())
-        return whole[self.free[:, None], self.free]
-
-    @cached_property
-    def target(self) -> Tensor:
-        """(M m,) r - S mu."""
-        return self.residual.flatten() - self.S.flatten(0, 1) @ self.mean
-
-    @cached_property
-    def factor(self) -> Factor:
-        """Of K = V + S P S^T."""
-        return Factor.of(self.V, self.S.flatten(0, 1) @ torch.linalg.cholesky(self.prior))
-
-    @cached_property
-    def solved(self) -> Tensor:
-        """(M m,) K^-1 (r - S mu)."""
-        return self.factor.solve(self.target[:, None])[:, 0]
-
-    @cached_property
-    def gain(self) -> Tensor:
-        """A (f, M m)."""
-        weighted = torch.linalg.solve(self.place.session.noise, self.S)  # (M, m, f)
-        wide = self.prior + self.opened * self.place.session.by_fit[self.free[:, None], self.free]
-        inverse = torch.linalg.inv(torch.linalg.inv(wide) + (weighted.mT @ self.S).sum(0))
-        return inverse @ weighted.flatten(0, 1).mT
-
-    @cached_property
-    def covariance(self) -> Tensor:
-        """U (f, f)."""
-        missed = torch.eye(len(self.free), dtype=self.V.dtype, device=self.V.device) - self.gain @ self.S.flatten(0, 1)
-        return missed @ self.prior @ missed.mT + self.gain @ self.V @ self.gain.mT
-
-    @cached_property
-    def step(self) -> Tensor:
-        """u (f,)."""
-        return self.mean + self.gain @ self.target
-
-    @cached_property
-    def left(self) -> Tensor:
-        """(M, m) what remains of the residual after the step."""
-        return self.residual - self.S @ self.step
-
-    def log_evidence(self, scale: float = 1.0) -> float:
-        """log N(r; S mu, scale K), but for a constant."""
-        return self.factor.log_density(self.target, self.solved / scale)
-
-    @cached_property
-    def alone(self) -> Tensor:
-        """(M, m, m) what makes the residual of each row one from the place that the others give."""
-        own = self.S @ self.gain.view(len(self.free), len(self.S), -1).movedim(1, 0)
-        return torch.linalg.inv(torch.eye(own.shape[1], dtype=own.dtype, device=own.device) - own)
-
-    @cached_property
-    def left_out(self) -> Tensor:
-        """(M, m) how far every row is from its prediction by the model as the other rows place it, m.
-
-        NaN where markers are hidden.
-        """
-        return (self.alone @ self.left[..., None])[..., 0].masked_fill(~self.visible, nan)
+    def rows(self) -> LinearRows:
+        """By the free unknowns; what is held is as an earlier registration knows it."""
+        own, date, both = self.session, self.date, (self.free[:, None], self.free)
+        Z, held = date.shared.flatten(0, 1), date.by_places.flatten(0, 1) * ~own.free
+        return LinearRows(
+            residual=date.residual,
+            S=date.by_places[..., self.free],
+            C=date.fit_covariance + Z @ Z.mT + held @ own.earlier @ held.mT,
+            noise=date.noise,
+            visible=date.visible,
+            prior=(own.earlier + torch.diag(date.deviations.square()))[both],
+            mean=torch.cat([own.centre.new_zeros(6), (own.old - self.markers).flatten()])[self.free],
+            by_fit=own.by_fit[both],
+        )
 
     @cached_property
     def inflation(self) -> float:
-        """Factor on all variances, one or more, with which 95 % regions hold the rows as placed by all others.
-
-        The errors that :attr:`left_out` has are linear in those of model and rows, so that their covariance is exact.
-        """
-        flat, (M, m) = self.S.flatten(0, 1), self.residual.shape
-        to_error = torch.eye(M * m, dtype=flat.dtype, device=flat.device) - flat @ self.gain
-        to_error = (self.alone @ to_error.view(M, m, -1)).flatten(0, 1)
-        whole = to_error @ (self.V + flat @ self.prior @ flat.mT) @ to_error.mT
-        covariance = row_blocks(whole, M)
-        markers, errors = m // 3, self.left_out.unflatten(1, (-1, 3))
+        """Factor on all variances, one or more, with which 95 % regions hold the rows as predicted by all others."""
+        markers, errors = self.rows.S.shape[1] // 3, self.rows.left_out.unflatten(1, (-1, 3))
+        covariance = own_blocks(torch.linalg.inv(self.rows.precisions), markers)
         away = errors.nan_to_num(0.0)[..., None]
-        squares = (away.mT @ torch.linalg.solve(own_blocks(covariance, markers), away))[..., 0, 0]
+        squares = (away.mT @ torch.linalg.solve(covariance, away))[..., 0, 0]
         squares = squares.masked_fill(errors.isnan().any(2), nan)
         return max(1.0, region_scale(squares, 3, torch.full_like(squares, 1.0 / markers), OTHER_DATE))
 
@@ -183,23 +127,24 @@ class Estimate:
         Args:
             falls: of the quadratic form by rows that are left out. coordinates: how many these have.
         """
-        determined = len(self.free) - torch.cholesky_inverse(self.factor.B).trace()
-        freedom = (self.visible.sum() - coordinates - determined).clamp(min=0.0) + PRIOR_FREEDOM
-        return ((self.target @ self.solved - falls).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
+        rows = self.rows
+        determined = len(self.free) - torch.cholesky_inverse(rows.factor.B).trace()
+        freedom = (rows.visible.sum() - coordinates - determined).clamp(min=0.0) + PRIOR_FREEDOM
+        return ((rows.target @ rows.solved.flatten() - falls).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
 
     def worst_rows(self) -> list[int]:
         """The one or two rows that contradict all others, or none."""
         from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
 
-        M, m = self.residual.shape
+        (M, m), visible = self.rows.residual.shape, self.rows.visible
         for size in (1, 2):
-            sets = torch.combinations(torch.arange(M, device=self.V.device), size)
+            sets = torch.combinations(torch.arange(M, device=visible.device), size)
             if M - size < 3 or len(sets) > MOST_PAIRS:
                 continue
             at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-            blocks, chosen = self.factor.inverse[at[:, :, None], at[:, None, :]], self.solved[at]
+            blocks, chosen = self.rows.factor.inverse[at[:, :, None], at[:, None, :]], self.rows.solved.flatten()[at]
             falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
-            coordinates = self.visible.sum(1)[sets].sum(1).to(falls)
+            coordinates = visible.sum(1)[sets].sum(1).to(falls)
             variances, freedom = self.scale(falls, coordinates)
             numbers = (each.numpy(force=True) for each in (coordinates, freedom, falls / coordinates / variances))
             chances = fdtrc(*numbers)
@@ -207,35 +152,3 @@ class Estimate:
             if chances[best] * len(sets) < FALSE_ALARM_PROBABILITY:
                 return sets[best].tolist()
         return []
-
-
-def row_blocks(V: Tensor, rows: int) -> Tensor:
-    """The blocks (M, m, m) of a matrix (M m, M m) on its diagonal."""
-    each = torch.arange(rows, device=V.device)
-    return V.view(rows, -1, rows, len(V) // rows)[each, :, each]
-
-
-def estimate(start: Place, metres: float) -> Estimate:
-    """The better estimate with B and without, by errors of rows left out.
-
-    Args:
-        start: where to begin. metres: prior deviation of the markers from their old places, m.
-    """
-    session = start.session
-    known_well = max(metres**2, float(session.fitted.new_noise.diagonal().mean()))
-    may = float(session.by_fit.diagonal().max()) > known_well and bool(session.free[6:].any())
-    found = [_estimate(start, metres, opened=opened) for opened in (True, False)[: 1 + may]]
-    return min(found, key=lambda each: float(each.left_out.square().nanmean()))
-
-
-def _estimate(place: Place, metres: float, *, opened: bool) -> Estimate:
-    """Gauss-Newton from a start; arguments as of :func:`estimate`."""
-    for _ in range(MAX_STEPS):
-        found = Estimate(place, metres, opened)
-        if float(found.step.abs().max()) >= SETTLED:
-            place = place.stepped(place.C.new_zeros(len(place.session.free)).index_copy(0, found.free, found.step))
-        elif place.exact:
-            break
-        else:
-            place = Place.of(place.session, place.T, place.body, place.C)
-    return found

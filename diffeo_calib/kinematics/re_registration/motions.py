@@ -81,11 +81,11 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
 
 def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
     points = FlangePoints(model.nominal, model.geometry.tool, same=True)
-    old, geodesic, seen = model.bodies.at(points.points), model.map.geodesic.with_nominal(points), ~errors.isnan()
-    slopes = marker_slopes(geodesic, points, geodesic.linearise(q)) @ old.slopes  # (N, m, d)
+    geodesic, seen = model.map.geodesic.with_nominal(points), ~errors.isnan()
+    slopes = marker_slopes(geodesic, points, geodesic.linearise(q))  # (N, m, m)
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
-    shift = (old.stepped(step).points - old.points).norm(dim=1)
+    shift = step.view(-1, 3).norm(dim=1)
     what = f"{model.bodies.moved_words(len(shift))} on the flange"
     return Motion(what, float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from math import exp, log, nan
+from math import exp, log
 from typing import Any, NamedTuple
 
 import torch
@@ -21,9 +21,9 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.both_dates import NewDate, both_dates, joins
-from diffeo_calib.kinematics.re_registration.estimate import Estimate, estimate
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.both_dates import both_dates, joins
+from diffeo_calib.kinematics.re_registration.estimate import Estimate
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
     Registration,
@@ -32,8 +32,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import (
     turned,
     undetermined,
 )
-from diffeo_calib.kinematics.re_registration.session import Place, Session
-from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.kinematics.re_registration.session import Session
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
@@ -44,9 +43,13 @@ from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
-SAME_PLACE, OTHER_MARKER = PLACES.same_registered_m, PLACES.other_registered_m
-"""Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
-MARKER_DEVIATIONS = (SAME_PLACE, PLACES.remounted_m, OTHER_MARKER)
+MARKER_DEVIATIONS = {
+    "same": (PLACES.same_registered_m, PLACES.same_m),
+    "moved": (PLACES.remounted_m, PLACES.remounted_m),
+    "other": (PLACES.other_registered_m, PLACES.other_m),
+}
+"""Prior standard deviations, m, of markers from where they were, in a registration, and from where it found them."""
+SAME_PLACE, OTHER_MARKER = MARKER_DEVIATIONS["same"][0], MARKER_DEVIATIONS["other"][0]
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 MOST_ROWS = 200
@@ -75,13 +78,13 @@ def register_again(
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
-    learn = learn and found.best.place.session.same and open_by < LARGEST_M_RAD and not registration.doubtful
+    learn = learn and found.best.session.same and open_by < LARGEST_M_RAD and not registration.doubtful
     learn = learn and (model.registration is None or free == "both")  # what is held must be known
-    if not (learn and joins(fit, len(found.best.residual))):
+    if not (learn and joins(fit, len(found.best.rows.residual))):
         placed = moved(fit, registration.transform).inflated(found.best.inflation)
         return RegisteredMap(placed, registration), registration
     learnt = moved(_learnt(fit, nominal, found.best), registration.transform)
-    own, old = robot_map(learnt), found.best.place.body.old
+    own, old = robot_map(learnt), found.best.session.old
     markers = own.geometry.tool + learnt.deformation.momenta.theta[own.geometry.slices["tool"]].view(-1, 3)
     return learnt, replace(registration, markers=markers, shift=markers - old)
 
@@ -94,23 +97,12 @@ STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
 
 def _learnt(fit: FittedMap, nominal: GeometryMap, found: Estimate) -> FittedMap:
     """The fit conditioned on the rows that took part, too, in its own frame, as if nothing but places had changed."""
-    place, session = found.place, found.place.session
-    framed, may = bool(session.free[0]), session.free[6:].view(len(place.body.points), -1).any(1)
-    metres = PLACES.same_m if found.metres == SAME_PLACE else found.metres
-    new = NewDate(
-        markers=place.body.old if found.metres == SAME_PLACE else place.body.points,
-        payload=session.nominal.payload,
-        q=session.data.q,
-        y=session.seen(place.T).flatten(1).nan_to_num(0.0),
-        noise=session.noise,
-        seen=found.visible,
-        shared=session.shared,
-        new_noise=_mean_noise(found),
-        frame=PLACES.found_m_rad * framed,
-        free=metres * may.repeat_interleave(3).to(session.noise),
-        centre=session.centre,
-    )
-    problem, start = both_dates(fit, nominal, new, [], found.inflation)
+    new, same = found.date, found.metres == SAME_PLACE
+    known = torch.full_like(new.deviations, PLACES.found_m_rad)
+    known[6:] = PLACES.same_m if same else found.metres
+    points = FlangePoints(new.points.fitted, found.session.old, same=True) if same else new.points
+    new = replace(new, points=points, deviations=known * found.session.free)
+    problem, start = both_dates(nominal, new, new.mean_noise, [], found.inflation)
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
@@ -248,10 +240,10 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
         return (SAME_PLACE,)  # not used: the markers stay
     if marker_std is not None:
         return (marker_std,)
-    return MARKER_DEVIATIONS if known else (OTHER_MARKER,)
+    return tuple(first for first, _ in MARKER_DEVIATIONS.values()) if known else (OTHER_MARKER,)
 
 
-def _starts(session: Session, widest: float) -> list[Place]:
+def _starts(session: Session, widest: float) -> list[Estimate]:
     """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
     framed, points = bool(session.free[0]), session.data.points
     starts = [session.at_old_places()] if session.known or not framed else []
@@ -260,19 +252,19 @@ def _starts(session: Session, widest: float) -> list[Place]:
     # as many coordinates as unknowns would fit any place
     if framed and bool(may.any()) and bool(shown.all()) and widest >= OTHER_MARKER:
         starts += [session.anywhere()] if len(known(points)) > len(session.free) else []
-    return [Place.of(session, *start) for start in starts]
+    return [Estimate.at(session, widest, *start) for start in starts]
 
 
-def _likeliest(starts: list[Place], metres: float) -> Estimate:
+def _likeliest(starts: list[Estimate], metres: float) -> Estimate:
     """The likeliest estimate under a prior."""
     usable = starts if metres >= OTHER_MARKER else starts[:1]
-    return max((estimate(start, metres) for start in usable), key=Estimate.log_evidence)
+    return max((start.settled(metres) for start in usable), key=lambda each: each.rows.log_evidence())
 
 
 def _odds(found: dict[float, Estimate]) -> dict[float, float]:
     """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
     scale = max(1.0, float(found[max(found)].scale()[0]))
-    logs = {metres: each.log_evidence(scale) for metres, each in found.items()}
+    logs = {metres: each.rows.log_evidence(scale) for metres, each in found.items()}
     logs |= {SAME_PLACE: logs[SAME_PLACE] + UNMOVED_LOG_ODDS} if SAME_PLACE in logs else {}
     odds = {metres: exp(each - max(logs.values())) for metres, each in logs.items()}
     likely = {metres: each for metres, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
@@ -281,42 +273,34 @@ def _odds(found: dict[float, Estimate]) -> dict[float, float]:
 
 def _record(best: Estimate, said: dict[str, Any]) -> Registration:
     """Everything in the new measuring frame."""
-    place, session, body, free = best.place, best.place.session, best.place.body, best.free
-    R = place.T[:3, :3]
-    whole, gain = session.earlier.clone(), best.gain.new_zeros(len(session.free), best.gain.shape[1])
-    whole[free], whole[:, free], gain[free] = 0.0, 0.0, best.gain
-    whole[free[:, None], free] = best.covariance * best.inflation
-    out = torch.block_diag(R, R, body.slopes)
+    session, markers, free, rows = best.session, best.markers, best.free, best.rows
+    R = best.T[:3, :3]
+    whole, gain = session.earlier.clone(), rows.gain.new_zeros(len(session.free), rows.gain.shape[1])
+    whole[free], whole[:, free], gain[free] = 0.0, 0.0, rows.gain
+    whole[free[:, None], free] = rows.covariance * best.inflation
+    out = torch.block_diag(R, R, torch.eye(markers.numel(), dtype=R.dtype, device=R.device))
     covariance = out @ whole @ out.mT
     covariance = 0.5 * (covariance + covariance.mT)
-    usual = float((best.inflation * best.V.diagonal()[best.visible.flatten()].median()).sqrt())
-    arm = float((session.seen(place.T) - session.centre).square().sum(-1).nanmean().sqrt())
-    geometry, count = session.nominal.geometry, len(body.points)
+    usual = float((best.inflation * rows.V.diagonal()[rows.visible.flatten()].median()).sqrt())
+    arm = float((session.seen(best.T) - session.centre).square().sum(-1).nanmean().sqrt())
+    geometry, count, lever = session.nominal.geometry, len(markers), session.data.lever
     tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
     return Registration(
-        transform=place.T,
-        markers=body.points,
-        lever=body.lever,
+        transform=best.T,
+        markers=markers,
+        lever=lever,
         same=session.same,
-        shift=body.points - body.old if session.known else None,
+        shift=markers - session.old if session.known else None,
         covariance=covariance,
-        centre=R @ session.centre + place.T[:3, 3],
+        centre=R @ session.centre + best.T[:3, 3],
         q=session.data.q,
         gain=((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(best.inflation * _mean_noise(best), R),
-        rms_after=_rms(best.residual.masked_fill(~best.visible, nan).unflatten(1, (-1, 3))),
-        left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
-        undetermined=undetermined(covariance, body.points, arm, usual, tips, rigid=body.lever is not None),
+        noise=turned(best.inflation * best.date.mean_noise, R),
+        rms_after=_rms(rows.shown(rows.residual).unflatten(1, (-1, 3))),
+        left_out_rms=_rms(rows.left_out.unflatten(1, (-1, 3))),
+        undetermined=undetermined(covariance, markers, arm, usual, tips, rigid=lever is not None),
         **said,
     )
-
-
-def _mean_noise(best: Estimate) -> Tensor:
-    """Covariance (m, m) of a new measurement, m^2: that of the fit for points that no row shows."""
-    session = best.place.session
-    found, unseen = mean_block(session.noise, best.visible), ~best.visible.any(0)
-    both = unseen[:, None] & unseen
-    return torch.where(both, session.fitted.new_noise, found) if bool(unseen.any()) else found
 
 
 def _rms(errors: Tensor) -> float:

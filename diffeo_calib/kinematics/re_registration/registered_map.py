@@ -171,16 +171,6 @@ class RegisteredMap(FittedMap):
         """The map of the fit."""
         return self.fitted
 
-    @property
-    def x(self) -> Tensor:
-        """(N, n) configurations of the fitted measurements."""
-        return self.fitted.x
-
-    @property
-    def m(self) -> int:
-        """Number of task coordinates."""
-        return self.registration.markers.numel()
-
     def to(self, device: torch.device | str) -> RegisteredMap:
         """The same map on a device, where its inputs must be too."""
         return RegisteredMap(self.fitted.to(device), self.registration)
@@ -230,8 +220,7 @@ class RegisteredMap(FittedMap):
         """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
         rows = q.to(self.deformation.x.device)
         points, at = self.geodesic.linearised_value(rows)
-        S = frame_slopes(points.detach().view(len(rows), -1, 3), self.registration.centre.to(points))
-        return torch.cat([S, marker_slopes(self.geodesic, self.points, at)], -1).flatten(0, 1)
+        return place_slopes(self.geodesic, at, points.detach(), self.registration.centre.to(points)).flatten(0, 1)
 
     @cached_property
     def _rows(self) -> Linearisation:
@@ -253,19 +242,16 @@ def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Li
     return (at.by_task_points @ shifts.view(len(at.by_task_points), 3, -1)).view(shifts.shape)
 
 
-def place_columns(
-    deformation: GeodesicDeformation, at: Linearisation, places: Tensor, centre: Tensor, *, frame: float, free: Tensor
-) -> Tensor:
-    """What rows share where the device's frame and the markers may be elsewhere: (N, 3 P, c), unit variance, m.
+def place_slopes(deformation: GeodesicDeformation, at: Linearisation, places: Tensor, centre: Tensor) -> Tensor:
+    """Derivatives (N, 3 P, 6 + 3 P) of points by shift and turn of the device's frame and by the markers' places.
 
     Args:
-        deformation: k1 around :class:`FlangePoints`. at: its linearisation at N configurations. places: (N, P, 3), m.
-        centre: (3,) about which the frame turns, m. frame: its prior deviation, m and rad; 0 where it stays.
-        free: (3 P,) those of the markers' coordinates, m.
+        deformation: k1 around :class:`FlangePoints`. at: its linearisation at N configurations.
+        places: (N, 3 P) points there, m. centre: (3,) about which the frame turns, m.
     """
     points: Any = deformation.spec.nominal
-    markers = (marker_slopes(deformation, points, at) * free)[..., free > 0]
-    return torch.cat([frame * frame_slopes(places, centre), markers], 2) if frame > 0 else markers
+    by_frame = frame_slopes(places.unflatten(1, (-1, 3)), centre)
+    return torch.cat([by_frame, marker_slopes(deformation, points, at)], -1)
 
 
 def robot_map(fitted: FittedMap) -> GeometryMap:

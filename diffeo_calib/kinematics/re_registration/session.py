@@ -11,22 +11,19 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import HARDLY
 from diffeo_calib.kinematics.re_registration.usual_noise import noise_of_rows
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.measurements.bodies import Bodies, Body
+from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.pose_frames import kind_of_points, own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import place, rigid_fit
-from diffeo_calib.robots.se3 import rotation, skew, transforms
-from diffeo_calib.sensors.set_ups import frame_slopes
+from diffeo_calib.robots.se3 import skew
 
 LEAST_POINTS = 3
 """Points that determine where a frame is."""
-SMALL_STEP = 1e-2
-"""Below such a step of the markers, m and rad, C hardly changes, and the model's points follow to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +32,14 @@ class Session:
 
     Args:
         model: the map, placed anew before or not. nominal: that of the fit, under the payloads of the rows.
-        data: M rows that show P points of the body. old: the body where the model has it, or at the tip.
-        known: whether it may be there. free: (6 + d,) boolean, which unknowns of frame and body may have moved.
+        data: M rows that show P points. old: (P, 3) where the model has them, or at the tip, m.
+        known: whether they may be there. free: (6 + 3 P,) boolean, which unknowns of frame and points may have moved.
     """
 
     model: FittedMap
     nominal: GeometryMap
     data: Measurements
-    old: Body
+    old: Tensor
     known: bool
     free: Tensor
 
@@ -67,11 +64,10 @@ class Session:
             what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
             got = kind_of_points(data.markers, data.lever)
             raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
-        old = seen.at(markers if known else seen.nowhere(data.markers, data.points))
-        numbers = torch.arange(6 + len(old.from_old), device=data.q.device)
+        old = markers if known else seen.nowhere(data.markers, data.points)
+        numbers = torch.arange(6 + old.numel(), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
-        framed = free != "marker"
-        _check_enough(data, 6 * framed + (0 if known else len(numbers) - 6), framed=framed)
+        _check_enough(data, framed=free != "marker", known=known)
         return cls(model, nominal, data, old, known, may)
 
     def rows(self, keep: Tensor) -> Session:
@@ -126,44 +122,39 @@ class Session:
 
     @cached_property
     def earlier(self) -> Tensor:
-        """(6 + d, 6 + d) covariance of frame and body by an earlier registration; zero without one."""
+        """(6 + 3 P, 6 + 3 P) covariance of frame and points by an earlier registration; zero without one."""
         before, found = self.model.registration, self.noise.new_zeros(len(self.free), len(self.free))
         if before is None:
             return found
-        arms = torch.eye(6, dtype=found.dtype, device=found.device)
-        arms[:3, 3:] = -skew(self.centre - before.centre)
-        if self.known:
-            to = torch.block_diag(arms, torch.linalg.pinv(self.old.slopes))
-            return to @ before.covariance @ to.mT
-        found[:6, :6] = arms @ before.covariance[:6, :6] @ arms.mT
+        size = len(found) if self.known else 6
+        to = torch.eye(size, dtype=found.dtype, device=found.device)
+        to[:3, 3:6] = -skew(self.centre - before.centre)
+        found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
         return found
 
     @cached_property
     def by_fit(self) -> Tensor:
-        """(6 + d, 6 + d) covariance of the body's old place by the fit, a part of C; zero elsewhere."""
+        """(6 + 3 P, 6 + 3 P) covariance of the points' old places by the fit where it hardly knew them; a part of C."""
         found = self.noise.new_zeros(len(self.free), len(self.free))
         if self.same:
             part = self.nominal.geometry.slices["tool"]
-            to = torch.linalg.pinv(self.old.slopes)
             numbers = torch.arange(part.start, part.stop, device=found.device)
-            fit = self.fitted.with_nominal(self.nominal.typical)
-            found[6:, 6:] = to @ fit.parameter_covariance(numbers) @ to.mT
+            known = self.fitted.with_nominal(self.nominal.typical).parameter_covariance(numbers)
+            variances, Q = torch.linalg.eigh(known)
+            open_by = variances * (variances > HARDLY**2 * self.fitted.new_noise.diagonal().mean())
+            found[6:, 6:] = (Q * open_by) @ Q.mT
         return found
 
-    def points_of(self, body: Body) -> FlangePoints:
-        """The nominal map of a body's points at the rows."""
-        return FlangePoints(self.nominal, body.points, same=self.same)
-
-    def at_old_places(self) -> tuple[Tensor, Body]:
-        """The body where it was, the frame (4, 4) in closed form, m."""
+    def at_old_places(self) -> tuple[Tensor, Tensor]:
+        """Frame (4, 4) in closed form, m, and the points where they were."""
         T = torch.eye(4, dtype=self.data.q.dtype, device=self.data.q.device)
         if bool(self.free[0]):
-            model = self.fitted.geodesic.with_nominal(self.points_of(self.old))
+            model = self.fitted.geodesic.with_nominal(FlangePoints(self.nominal, self.old, same=self.same))
             T = rigid_fit(model(self.data.q).view(-1, 3), self.data.points.flatten(0, 1))
         return T, self.old
 
-    def anywhere(self) -> tuple[Tensor, Body]:
-        """Frame (4, 4) and body in closed form, m; what never moves stays."""
+    def anywhere(self) -> tuple[Tensor, Tensor]:
+        """Frame (4, 4) and points in closed form, m; what never moves stays."""
         own, points = self.nominal.geometry, self.data.points
         tips = list(dict.fromkeys(own.on)) if len(own.on) == points.shape[1] else [own.on[0]]
         corners = tool_points(tool_transform(None).to(points.device)).repeat(len(tips), 1)
@@ -172,60 +163,14 @@ class Session:
         carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * points.shape[1]
         found = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
         shown = (~points.isnan()).any(2).any(0)
-        return found.base, self.old.at(torch.where(shown[:, None], found.tool, self.old.old))
+        return found.base, torch.where(shown[:, None], found.tool, self.old)
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A frame T (4, 4), m, and a body, with the rows as the model sees them from there.
-
-    Args:
-        points: (M, P, 3) of the model, m. slopes: (M, 3 P, d) of these by the body.
-        C: (3 P M, 3 P M) their posterior covariance by the fit. exact: whether no step was to first order.
-    """
-
-    session: Session
-    T: Tensor
-    body: Body
-    points: Tensor
-    slopes: Tensor
-    C: Tensor
-    exact: bool = True
-
-    @classmethod
-    def of(cls, session: Session, T: Tensor, body: Body, covariance: Tensor | None = None) -> Place:
-        """The rows from there; the covariance C is passed if it is known already."""
-        points = session.points_of(body)
-        deformation = session.fitted.geodesic.with_nominal(points)
-        value, at = deformation.linearised_value(session.data.q)
-        slopes = marker_slopes(deformation, points, at) @ body.slopes
-        C = session.fitted.covariance_between(at) if covariance is None else covariance
-        return cls(session, T, body, value.unflatten(1, (-1, 3)), slopes, C)
-
-    @cached_property
-    def residual(self) -> Tensor:
-        """(M, 3 P) m; zero where hidden."""
-        return (self.session.seen(self.T) - self.points).nan_to_num(0.0).flatten(1)
-
-    @cached_property
-    def by_unknowns(self) -> Tensor:
-        """(M, 3 P, 6 + d) derivatives by frame and body."""
-        return torch.cat([frame_slopes(self.points, self.session.centre), self.slopes], -1)
-
-    def stepped(self, step: Tensor) -> Place:
-        """After a step (6 + d,) of frame and body."""
-        turn, centre, moved = rotation(step[3:6]), self.session.centre, float(step[6:].abs().max())
-        T = self.T @ transforms(turn, centre + step[:3] - turn @ centre)
-        body = self.body.stepped(step[6:])
-        if moved > SMALL_STEP:
-            return Place.of(self.session, T, body)
-        points = self.points + (self.slopes @ step[6:]).view_as(self.points)
-        return replace(self, T=T, body=body, points=points, exact=self.exact and moved == 0.0)
-
-
-def _check_enough(data: Measurements, unknowns: int, *, framed: bool) -> None:
+def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    each = data.bodies.numbers * float(data.seen_bodies.sum()) / len(data)
+    bodies = data.bodies
+    each = bodies.numbers * float(data.seen_bodies.sum()) / len(data)
+    unknowns = 6 * framed + bodies.numbers * (data.markers // bodies.points) * (not known)
     points = -(-LEAST_POINTS // data.markers) if framed else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:

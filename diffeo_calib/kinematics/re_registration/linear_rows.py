@@ -1,0 +1,210 @@
+"""Rows of a new set-up beside a fitted model, to first order, with what may have moved since.
+
+    r = S u + e + noise,    u ~ N(mu, P),    cov(e) = C,    cov(noise) = R,
+
+r measured minus predicted, u shifts of devices and markers, C the posterior covariance of the fit and of whatever else
+these rows share. With V = C + R and K = V + S P S^T their evidence is that of N(S mu, K), and rows J left out are off
+their prediction by (K^-1)_JJ^-1 mu_J with mu = K^-1 (r - S mu).
+
+Places are where the rows fit best, weighed by the noise alone:
+
+    u = mu + A (r - S mu),    A = ((P + B)^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
+
+B is the covariance of the markers' old places by the fit, a part of C, where the fit hardly knew them, as along the
+axis of a tool that was never tilted: there the rows place a marker, though it stayed. R in place of V in the weights
+costs 1 % where the model is right. Where the robot has changed since its fit, errors are not correlated as C says, and
+weights by V do harm: on another series of a UR10 more rows hurt, and where the model is uncertain by centimetres, as
+much is left in the rows, although another place explains it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import nan
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.nominal import FlangePoints
+from diffeo_calib.kinematics.re_registration.registered_map import place_slopes
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.maps.observation import Observation
+from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.factor import Factor
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+@dataclass(frozen=True, eq=False)
+class NewDate:
+    """M rows of a new set-up in the frame of a fit.
+
+    Args:
+        fitted: the map of the fit. points: k0 of the markers where they are now, under the payloads of the rows.
+        q: (M, n). y: (M, R) measured numbers, m; any where hidden. noise: (M, R, R) m^2.
+        visible: (M, R) boolean, the numbers that were measured.
+        shared: (M, R, c) effects of errors of unit variance that they share, m.
+        deviations: (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of
+            what has not moved. centre: (3,) about which the frame turns, m.
+        observe: what was measured of the markers; None for their coordinates.
+    """
+
+    fitted: FittedMap
+    points: FlangePoints
+    q: Tensor
+    y: Tensor
+    noise: Tensor
+    visible: Tensor
+    shared: Tensor
+    deviations: Tensor
+    centre: Tensor
+    observe: Observation | None
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @cached_property
+    def seen(self) -> tuple[Tensor, Linearisation]:
+        """The points (M, 3 P) by the fit, m, and their linearisation."""
+        points, at = self.fitted.geodesic.with_nominal(self.points).linearised_value(self.q)
+        return points.detach(), at
+
+    @cached_property
+    def slopes(self) -> Tensor | None:
+        """(M, R, 3 P) of what was measured; None for all coordinates."""
+        return None if self.observe is None else self.observe.slope(self.seen[0]).detach()
+
+    @cached_property
+    def at(self) -> Linearisation:
+        """Linearised prediction of the fit for the measured numbers."""
+        return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """(M, R) measured minus predicted, m; zero where hidden."""
+        away = self.y - (self.seen[0] if self.observe is None else self.observe.value(self.seen[0]))
+        return away.masked_fill(~self.visible, 0.0)
+
+    @cached_property
+    def by_places(self) -> Tensor:
+        """(M, R, 6 + 3 P) derivatives by frame and markers."""
+        deformation = self.fitted.geodesic.with_nominal(self.points)
+        found = place_slopes(deformation, self.seen[1], self.seen[0], self.centre)
+        return found if self.slopes is None else self.slopes @ found
+
+    @cached_property
+    def fit_covariance(self) -> Tensor:
+        """(M R, M R) posterior covariance of the fit at the rows, m^2."""
+        return self.fitted.covariance_between(self.at)
+
+    @property
+    def weighted_noise(self) -> Tensor:
+        """(M, R, R) covariance of the rows with their weights, m^2."""
+        return self.noise
+
+    @property
+    def mean_noise(self) -> Tensor:
+        """(R, R) covariance of a new measurement, m^2: that of the fit for points that no row shows."""
+        found, unseen = mean_block(self.noise, self.visible), ~self.visible.any(0)
+        both = unseen[:, None] & unseen
+        return torch.where(both, self.fitted.new_noise, found) if bool(unseen.any()) else found
+
+    def changed(self, **changes: object) -> Self:
+        """The same rows with another noise or prior; what does not change is kept."""
+        other = replace(self, **changes)
+        keep = "seen", "slopes", "at", "residual", "by_places", "fit_covariance"
+        vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
+        return other
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRows:
+    """M rows of R numbers and k unknowns.
+
+    Args:
+        residual: (M, R) r, m. S: (M, R, k). C: (M R, M R), m^2. noise: (M, R, R) blocks of R, m^2.
+        visible: (M, R) boolean, the numbers that were measured.
+        prior: (k, k) P. mean: (k,) mu. by_fit: (k, k) B.
+    """
+
+    residual: Tensor
+    S: Tensor
+    C: Tensor
+    noise: Tensor
+    visible: Tensor
+    prior: Tensor
+    mean: Tensor
+    by_fit: Tensor
+
+    @cached_property
+    def slopes(self) -> Tensor:
+        """(M R, k) S."""
+        return self.S.flatten(0, 1)
+
+    @cached_property
+    def V(self) -> Tensor:
+        """(M R, M R), m^2."""
+        V = self.C + torch.block_diag(*self.noise)
+        return 0.5 * (V + V.mT)
+
+    @cached_property
+    def target(self) -> Tensor:
+        """(M R,) r - S mu."""
+        return self.residual.flatten() - self.slopes @ self.mean
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Of K."""
+        return Factor.of(self.V, self.slopes @ torch.linalg.cholesky(self.prior))
+
+    @cached_property
+    def solved(self) -> Tensor:
+        """(M, R) K^-1 (r - S mu)."""
+        return self.factor.solve(self.target[:, None]).view(self.residual.shape)
+
+    @cached_property
+    def precisions(self) -> Tensor:
+        """(M, R, R) blocks of K^-1: of each row's error as the model and all other rows predict it."""
+        return diagonal_blocks(self.factor.inverse, len(self.residual))
+
+    @cached_property
+    def left_out(self) -> Tensor:
+        """(M, R) how far each row is from its prediction by the model and all other rows, m; NaN where hidden."""
+        return self.shown(torch.linalg.solve(self.precisions, self.solved[..., None])[..., 0])
+
+    def shown(self, values: Tensor) -> Tensor:
+        """Values (M, R) or (M R,), NaN where hidden."""
+        return values.view(self.residual.shape).masked_fill(~self.visible, nan)
+
+    def log_evidence(self, scale: float = 1.0) -> float:
+        """log N(r; S mu, scale K), but for a constant."""
+        return self.factor.log_density(self.target, self.solved.flatten() / scale)
+
+    @cached_property
+    def gain(self) -> Tensor:
+        """A (k, M R)."""
+        weighted = torch.linalg.solve(self.noise, self.S)
+        inverse = torch.linalg.inv(self.prior + self.by_fit) + (weighted.mT @ self.S).sum(0)
+        return torch.linalg.solve(inverse, weighted.flatten(0, 1).mT)
+
+    @property
+    def step(self) -> Tensor:
+        """u (k,)."""
+        return self.mean + self.gain @ self.target
+
+    @property
+    def covariance(self) -> Tensor:
+        """U (k, k)."""
+        missed = torch.eye(len(self.prior), dtype=self.V.dtype, device=self.V.device) - self.gain @ self.slopes
+        return missed @ self.prior @ missed.mT + self.gain @ self.V @ self.gain.mT
+
+    @cached_property
+    def after_placing(self) -> Tensor:
+        """(M R, M R) what becomes of errors once everything is where the rows fit best, 1 - S A."""
+        eye = torch.eye(len(self.slopes), dtype=self.V.dtype, device=self.V.device)
+        return eye - self.slopes @ self.gain
