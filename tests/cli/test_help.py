@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from command_bank import Command
 
-UNITS = "--length --angle --joint-length --joints --sep --decimal"
+UNITS = "--length --angle --joint-length --joints --robot-pose --sep --decimal"
 ROWS = (
     "--position --rotation --convention --rotation-angle --lever --camera-on-tool --std --rotation-std --socket "
     "--distance --distance-std --reading --session --remounted --payload --time --temperature --marker --places --by"
@@ -31,7 +31,7 @@ TEXTS = {
     "export": (
         "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --ur-hash --joint-offsets "
         "--correction-tables --with-tables --robot --length --angle --c --torch --onnx --camera --tool "
-        "--tool-from --frame --payload-mass --tip"
+        "--tool-from --frame --payload-mass --tip --field --grid"
     ),
     "plan": (
         f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
@@ -86,7 +86,7 @@ def test_help_explains_every_option(name: str, command: Command) -> None:
 
 def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:
     found = entries(command("fit", "--help").out)
-    assert "[required]" in found["--robot"]
+    assert "required" not in found["--robot"]  # or --robot-pose
     assert "[required]" in found["CSV"]
     assert "required" not in found["--joints"]
     assert "default: 0.3" in found["--holdout"]
