@@ -110,6 +110,10 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command) -> None:
     assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
     done = command("fit", tmp_path / "c.toml")
     assert done.code == 0, done.error
+    told_alone = write_columns(tmp_path / "told.csv", x_y_z=1e3 * told[:5])
+    done = command("predict", tmp_path / "t.safetensors", told_alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.error
+    assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     done = command(
         "export", tmp_path / "t.safetensors", "--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"
     )

@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
@@ -52,7 +53,9 @@ def run(given: PredictOptions) -> None:
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:
         check_payload_column(kinematics, table.payload)
-    prefixes = kinematics.bodies.prefixes(kinematics)
+    prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(names, robot.kinds)
+    if {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"} & {*Columns.of(columns).names}:  # of told places
+        prefixes = tuple(f"predicted_{prefix}" for prefix in prefixes)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     values = read_configurations(given.csv, names, table, kinds=robot.kinds)
     q, masses = values["q"], values.get("payload")
