@@ -15,7 +15,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import proposals
-from diffeo_calib.cli.column_names import column, whole
+from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import ROTATIONS, Sheet
 from diffeo_calib.cli.proposals import ALL_CONVENTIONS, Source
 from diffeo_calib.cli.row_columns import Choice, RowColumns, matrix_in, rows_in
@@ -42,7 +42,11 @@ SEEN = {
     "object",
     "world",
 }
+SEEN |= WORDS["measured"]
 """Words of names of the machine's own poses, and of what was seen."""
+WISHED = WORDS["wished"] - {"target"}
+NUMBERED = "0123456", "1234567", "012345", "123456"
+"""Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
 LARGEST_IN_METRES = 20.0
 """No machine is told a place so far away, m."""
 MOST_ROWS, STEPS = 40, (1, 3)
@@ -75,31 +79,38 @@ class Reading:
 
 
 def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
-    """Places with the rotations that follow them, or poses as 16 numbers, in the order of the columns."""
-    places = [list(group.names.values()) for group in whole(sheet.numbers, "xyz")]
+    """Places with the rotations that follow them, and poses as 6, 7, 12 or 16 numbers, in the order of the columns."""
+    at = {name: number for number, name in enumerate(sheet.header)}
     triples = [group for group in whole(sheet.numbers, "xyz") if not group.says("rate", "deviation", "turn")]
-    places = sorted((list(group.names.values()) for group in triples), key=lambda own: sheet.header.index(own[0]))
-    found, starts = list[Body](), [sheet.header.index(own[0]) for own in places] + [len(sheet.header)]
+    places = sorted((list(group.names.values()) for group in triples), key=lambda own: at[own[0]])
+    found, starts = list[Body](), [*(at[own[0]] for own in places), len(sheet.header)]
     for own, end in zip(places, starts[1:], strict=True):
-        behind = [name for name in sheet.header[sheet.header.index(own[0]) : end] if name in sheet.numbers]
-        turns = [
-            list(group.names.values())
-            for labels, _ in ROTATIONS
-            for group in whole([name for name in behind if name not in own], labels)
-            if not group.says("rate", "deviation")
-        ]
+        behind = [name for name in sheet.header[at[own[0]] : end] if name in sheet.numbers and name not in own]
+        turns = [group for labels, _ in ROTATIONS for group in whole(behind, labels)]
+        turns = [list(group.names.values()) for group in turns if not group.says("rate", "deviation")]
         found.append(Body(own, turns[0] if turns else []))
-    left = list(sheet.numbers)
-    while not places and (matrix := matrix_in(csv, sheet, left)):
-        place, turn = (list(names) for names in matrix)
-        found.append(Body(place, turn))
-        left = [name for name in left if name not in (*place, *turn)]
-    return found
+    used = {name for own in found for name in (*own.place, *own.turn)}
+    while matrix := matrix_in(csv, sheet, [name for name in sheet.numbers if name not in used]):
+        found.append(Body(*(list(names) for names in matrix)))
+        used |= {*found[-1].place, *found[-1].turn}
+    for labels in NUMBERED:
+        for group in whole([name for name in sheet.numbers if name not in used], labels):
+            names = list(group.names.values())
+            if group.says("tool") and not group.says("rate", "deviation"):
+                found.append(Body(names[:3], names[3:]))
+                used |= {*names}
+    return sorted(found, key=lambda own: at[own.place[0]])
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
-    """That of the machine: by words of the names, else the first."""
-    return max(bodies, key=lambda own: len(own.words & MACHINE) - len(own.words & SEEN))
+    """That of the machine: by words of the names, reported ones before wished ones; else the first."""
+
+    def rank(own: Body) -> int:
+        if own.words & MACHINE:
+            return 2 + bool(own.words & WORDS["measured"])
+        return bool(own.words & WISHED) - len(own.words & SEEN)
+
+    return max(bodies, key=rank)
 
 
 def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]]:

@@ -44,8 +44,8 @@ def seen(told: Tensor, *, camera_on_tool: bool, seed: int = 9) -> Tensor:
 
 
 def write_columns(path: Path, **columns: Tensor) -> Path:
-    """A table with the columns of each group, such as ``x_y_z=(N, 3)``."""
-    names = [name for group in columns for name in group.split("_")]
+    """A table with the columns of each group, such as ``x_y_z=(N, 3)``, or ``"cmd_x|cmd_y"``."""
+    names = [name for group in columns for name in group.split("|" if "|" in group else "_")]
     lines = [",".join(f"{value:.8g}" for value in row) for row in torch.cat([*columns.values()], 1).tolist()]
     path.write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
     return path

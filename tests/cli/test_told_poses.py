@@ -9,11 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
-from told_bank import BOARD, CAMERA, bent, drawn, flange, seen, write_columns
+from told_bank import BOARD, CAMERA, bent, drawn, flange, seen, turned, write_columns
 from torch import Tensor
 
+from diffeo_calib.cli import told_poses
+from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 if sys.version_info >= (3, 11):
@@ -54,6 +57,27 @@ def test_init_finds_what_the_numbers_mean(
     assert found["length"] == "mm"
     assert found["angle"] == angle or convention.startswith("quat")
     assert found.get("camera-on-tool", False) is camera_on_tool
+
+
+@pytest.mark.parametrize(
+    ("names", "machine"),
+    [
+        ("a_x a_y a_z b_x b_y b_z", "a_x"),
+        ("x_ist y_ist z_ist x_soll y_soll z_soll", "x_soll"),
+        ("cam_x cam_y cam_z x y z", "x"),
+        ("board_x board_y board_z tcp_x tcp_y tcp_z", "tcp_x"),
+        ("target_TCP_pose_0 target_TCP_pose_1 target_TCP_pose_2 target_TCP_pose_3 target_TCP_pose_4 target_TCP_pose_5 "
+         "actual_TCP_pose_0 actual_TCP_pose_1 actual_TCP_pose_2 actual_TCP_pose_3 actual_TCP_pose_4 actual_TCP_pose_5 "
+         "x y z", "actual_TCP_pose_0"),
+        (" ".join(f"O_T_EE_{k}" for k in range(16)) + " tag_x tag_y tag_z", "O_T_EE_12"),
+    ],
+)  # fmt: skip
+def test_whose_columns_are_the_machine_s(names: str, machine: str, tmp_path: Path) -> None:
+    pose = transforms(turned(drawn(4, 3, seed=2)), drawn(4, 3, seed=3)).mT.flatten(1)  # by columns
+    values = torch.cat([pose if "O_T_EE" in names else drawn(4, 0, seed=1), drawn(4, 30, seed=1)], 1)
+    table = write_columns(tmp_path / "t.csv", **{"|".join(names.split()): values[:, : len(names.split())]})
+    found = told_poses.bodies_in(table, guess_sheet(table))
+    assert told_poses.machine_of(found).place[0] == machine
 
 
 def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, command: Command) -> None:
