@@ -60,7 +60,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
             ],
         ),
         ("diffeo-calib pre", ["predict"]),
-        ("diffeo-calib fit --ro", ["--robot", "--rotation", "--rotation-angle", "--rotation-std"]),
+        ("diffeo-calib fit --ro", ["--robot", "--robot-pose", "--rotation", "--rotation-angle", "--rotation-std"]),
         ("diffeo-calib fit --length ", ["m", "mm", "cm", "inch"]),
         ("diffeo-calib --vers", ["--version"]),
     ],
