@@ -17,23 +17,23 @@ FRAME = "_optical_frame"
 
 
 def camera_files(
-    model: CalibratedKinematics, geometry: Geometry | None = None, *, on_tool: bool = True
+    model: CalibratedKinematics, geometry: Geometry | None = None, *, on_tool: bool | None = None
 ) -> dict[str, str]:
     """Names and contents of the files; those of several cameras begin with the camera's name.
 
     Args:
         model: of images of a board, or of its poses, which tell no lens. geometry: rigid kinematics that the camera's
-            place belongs to; the model's own by default. on_tool: whether the camera is on the tool, where poses of
-            the board were measured.
+            place belongs to; the model's own by default. on_tool: whether the camera is on the tool; needed
+            where poses of the board were measured.
 
     Raises:
         InputError: a model without such a camera, or one that was registered again.
     """
     cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
-    if not cameras and model.lever is None:
-        fix = "calibrate with a table of `images`, or with poses of a board"
+    if not cameras and (model.lever is None or on_tool is None):
+        fix = "calibrate with a table of `images`; of poses of a board say whether the camera is on the tool"
         raise InputError.of("the camera of the model", expected="one that saw a board", got="none", fix=fix)
-    on_tool = next(iter(cameras.values())).on_tool if cameras else on_tool
+    on_tool = next(iter(cameras.values())).on_tool if cameras else bool(on_tool)
     found, each = dict[str, str](), HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry)
     for name, own in each.items():
         known, files = name.replace("/", "_"), dict[str, str]()

@@ -130,7 +130,7 @@ def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     assert float((away - HandEye.of(on_tool()).camera.pose[:3, 3]).norm()) < 5e-3
     wrong = command("export", kind_named("positions").file, "--camera", folder)
     assert wrong.code == 1
-    assert "saw a board in images" in wrong.error
+    assert "expected one that saw a board, got none" in wrong.error
 
 
 def test_what_explains_the_errors_adds_up() -> None:

@@ -115,7 +115,7 @@ class _Export:
         """The files of the camera; its place belongs to the rigid kinematics, if any are written."""
         made = self.model.provenance
         words = [] if made is None else shlex.split(made.command or "")
-        files = camera_files(self.model, self.geometry, on_tool="--camera-on-tool" in words)
+        files = camera_files(self.model, self.geometry, on_tool="--camera-on-tool" in words if words else None)
         make_folder(folder)
         belongs = "the calibrated model" if self.geometry is None else "the rigid kinematics written beside it"
         self.lines.append(f"camera: {', '.join(files)} in {folder}; its place belongs to {belongs}")
