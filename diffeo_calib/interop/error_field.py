@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from math import prod
 
 import torch
 
@@ -38,11 +39,11 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     if len(counts) != axes or min(counts) < 2:
         expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}"
         raise InputError.of(f"--grid {grid}", expected=expected)
-    if (points := int(torch.tensor(counts).prod())) > MOST_POINTS:
+    if (points := prod(counts)) > MOST_POINTS:
         raise InputError.of(f"--grid {grid}", expected=f"at most {MOST_POINTS} points", got=points)
     fitted = model.configurations
     ends = zip(fitted.amin(0)[:axes].tolist(), fitted.amax(0)[:axes].tolist(), counts, strict=True)
-    lines = [torch.linspace(*each, dtype=fitted.dtype) for each in ends]
+    lines = [torch.linspace(*each, dtype=fitted.dtype, device=fitted.device) for each in ends]
     places = torch.cartesian_prod(*lines).view(-1, axes)
     q = torch.cat([places, places.new_zeros(len(places), robot.n - axes)], 1)
     targets = robot(q) @ model.tool
