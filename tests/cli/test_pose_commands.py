@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -148,9 +149,9 @@ def test_predict_with_poses(
     assert (done.code, done.err.strip()) == (0, "")
     assert "20 predictions written" in done.out
     assert "joints, poses and standard deviations" in done.out
-    printed = re.search(r"`evaluate` and `fit` read these poses with (--position .*)", done.out)
+    printed = re.search(r"`evaluate` and `fit` read these poses with (--.*)", done.out)
     assert printed is not None
-    again = command("evaluate", posed_site.path, tmp_path / "p.csv", *units, *printed[1].split())
+    again = command("evaluate", posed_site.path, tmp_path / "p.csv", *units, *shlex.split(printed[1]))
     assert again.code == 0
     assert max(all_numbers(again, "20 in all")) < 1e-3
     header, *rows = (tmp_path / "p.csv").read_text().splitlines()
