@@ -36,9 +36,8 @@ from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import SocketColumns
-from diffeo_calib.measurements.poses import numbers_of
+from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
@@ -50,8 +49,6 @@ BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0
 """Of the ball on the tool by images, m."""
 FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
-ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
-"""Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
 """Median residual, as a share of the spread, above which no reading is right."""
 UNITS = (*UNITS_PER_METRE,), ("rad", "deg")

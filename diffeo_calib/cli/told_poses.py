@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,12 +18,12 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import ROTATIONS, Sheet
-from diffeo_calib.cli.proposals import ALL_CONVENTIONS, Source
+from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, RowColumns, matrix_in, rows_in
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
-from diffeo_calib.measurements.poses import numbers_of, rotation_matrices
+from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.se3 import nearest_rotations
@@ -47,8 +48,8 @@ SEEN |= WORDS["measured"]
 WISHED = WORDS["wished"] - {"target"}
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
-LARGEST_IN_METRES = 20.0
-"""No machine is told a place so far away, m."""
+SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
+"""Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 MOST_WAYS = 8
@@ -125,9 +126,15 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
         raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
-    rows = rows_in(csv, replace(sheet, numbers=tuple(name for name in sheet.numbers if name not in used)), used)
-    rows = replace(rows, markers=rows.markers[:1])
+    others = tuple(name for name in sheet.numbers if name not in used)
+    if not others:
+        what = f"what was measured of the machine in '{csv}'"
+        raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
+    rows = rows_in(csv, replace(sheet, numbers=others), used)
     body = next((own for own in bodies if rows.markers and own.place == rows.markers[0]), None)
+    if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
+        left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
+        rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
     found = sorted(_read(csv, sheet, machine, rows, body), key=lambda entry: entry[0])
     if found and found[0][0] == inf:
         found[0][1].read_residual(found[0][1].table)  # says why
@@ -138,36 +145,35 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
             "check that the rows belong together, or write the campaign file yourself; for joint values name the robot"
         )
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
-    size, source = found[0]
-    others = [one for one in found[1:] if one[0] < gates.READINGS_TOLD_APART * size]
-    worse = next((left for left, _ in found if left >= gates.READINGS_TOLD_APART * size), inf)
-    return source, *_entries(source, machine, size, worse, [one for _, one in others])
-
-
-def _entries(
-    source: Source, machine: Body, size: float, worse: float, others: Sequence[Source]
-) -> tuple[list[Choice], list[Choice]]:
-    """Entries about columns, and about units and conventions; comments where readings are as good."""
+    size, limit = found[0][0], gates.READINGS_TOLD_APART * found[0][0]
+    alike, worse = [one for left, one in found if left < limit], [left for left, _ in found if left >= limit]
     why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
-    why += f", read in any other way {100 * worse:.3g} %" if worse < inf else ""
-    first = "; by their names, poses that the machine was told, in place of joint values"
-    texts = list(dict.fromkeys(one.joints.text for one in (source, *others)))
-    columns = [Choice("robot-pose", text, why + first, sure=len(texts) == 1) for text in texts]
-    table, units = source.table, list[Choice]()
-    units.append(Choice("length", table.length, "the size of the numbers"))
-    units.append(Choice("angle", table.angle, why))
-    if table.joint_length is not None:
-        units.append(Choice("joint-length", table.joint_length, why))
-    if table.rotation is not None:
-        units.append(Choice("rotation", ",".join(map(str, table.rotation)), "behind the columns of its place"))
-        known = list(dict.fromkeys((one.table.convention, one.table.rotation_angle) for one in (source, *others)))
-        for convention, angle in known:
-            units.append(Choice("convention", str(convention), why, sure=len(known) == 1))
-            if angle is not None:
-                units.append(Choice("rotation-angle", angle, "the same", sure=len(known) == 1))
-    if table.camera_on_tool:
-        units.append(Choice("camera-on-tool", True, "what stands is seen from the flange"))
-    return columns, units
+    why += f", read in any other way {100 * min(worse):.3g} %" if worse else ""
+    first = f"{why}; by their names, poses that the machine was told, in place of joint values"
+    columns = [*_every("robot-pose", [one.joints.text for one in alike], first)]
+    return alike[0], columns, [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+
+
+def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
+    """Units and conventions of the ways to read a table that explain it as well as each other."""
+    tables = [one.table for one in alike]
+    size = "the size of the numbers" + "; which machine it is, they do not tell" * (len(lengths) > 1)
+    yield from _every("length", lengths if len(lengths) > 1 else [tables[0].length], size)
+    yield from _every("joint-length", [table.joint_length for table in tables], size)
+    yield from _every("angle", [table.angle for table in tables], why)
+    if tables[0].rotation is not None:
+        yield Choice("rotation", ",".join(map(str, tables[0].rotation)), "behind the columns of its place")
+        yield from _every("convention", [table.convention for table in tables], why)
+        yield from _every("rotation-angle", [table.rotation_angle for table in tables], "the same")
+    yield from _every(
+        "camera-on-tool", [table.camera_on_tool for table in tables], "what stands is seen from the flange"
+    )
+
+
+def _every(name: str, values: Sequence[Any], why: str) -> Iterator[Choice]:
+    """An entry for every value that is not None or False, for the user to choose from where there are several."""
+    different = list(dict.fromkeys(values))
+    return (Choice(name, one, why, sure=len(different) == 1) for one in different if one not in (None, False))
 
 
 def _read(
@@ -176,8 +182,8 @@ def _read(
     """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
     turn, seen_at = ([], None) if body is None else (body.turn, _numbers(csv, sheet, body.place))
     told_at = _numbers(csv, sheet, machine.place)
-    length = _length(machine.place, told_at)
-    other = length if body is None or seen_at is None else _length(body.place, seen_at)
+    length = _lengths(machine.place, told_at)[0]
+    other = length if body is None or seen_at is None else _lengths(body.place, seen_at)[0]
     own, seen = (_readings(_numbers(csv, sheet, names)) for names in (machine.turn, turn))
     if own and seen and told_at is not None and seen_at is not None:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((told_at, length), (seen_at, other))]
@@ -208,12 +214,13 @@ def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor | None:
     return None
 
 
-def _length(names: Sequence[str], values: Tensor | None) -> str:
-    """Unit of lengths, by the names, or by the size of the numbers."""
+def _lengths(names: Sequence[str], values: Tensor | None) -> tuple[str, ...]:
+    """Units of lengths that places may have, by their names, else by the size of the numbers; the likeliest first."""
     named = {column(name).unit for name in names} - {""}
     if len(named) == 1:
-        return named.pop()
-    return "mm" if values is not None and float(values.abs().max()) > LARGEST_IN_METRES else "m"
+        return (named.pop(),)
+    largest = 0.0 if values is None else float(values.abs().max())
+    return ("mm",) if largest > LARGEST_IN_METRES else ("m",) if largest < SURELY_METRES else ("m", "mm")
 
 
 def _readings(numbers: Tensor | None) -> dict[Reading, Tensor]:

@@ -66,6 +66,16 @@ def is_euler(convention: object) -> bool:
     return one_case and convention[0] != convention[1] != convention[2]
 
 
+EULER = tuple(
+    order
+    for letters in ("xyz", "XYZ")
+    for order in ("".join((a, b, c)) for a in letters for b in letters for c in letters)
+    if is_euler(order)
+)
+"""The 24 orders of Euler angles."""
+ALL_CONVENTIONS = (*NUMBERS, *EULER)
+
+
 def rotation_matrices(values: object, convention: str, *, angle: str = "rad", place: Place = "row {}".format) -> Tensor:
     """Convert rotations written as rows of numbers.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -171,3 +172,49 @@ def test_neither_a_robot_nor_poses(tmp_path: Path, command: Command) -> None:
     done = command("fit", table, "--length", "mm", "--angle", "deg", "--position", "tx,ty,tz", "-o", tmp_path / "m")
     assert done.code == 1
     assert "expected --robot FILE, or --robot-pose COLUMNS" in done.error
+
+
+def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, command: Command) -> None:
+    """Within 5 mm, or 5 m: the user says which."""
+    told = 5.0 * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=told, x_y_z=bent(told))
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    text = (tmp_path / "c.toml").read_text(encoding="utf-8")
+    assert '# length = "m"' in text
+    assert '# length = "mm"' in text
+
+
+def test_two_markers_of_a_machine_that_is_told_places(tmp_path: Path, command: Command) -> None:
+    told = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    markers = {"left_x|left_y|left_z": bent(told), "right_x|right_y|right_z": bent(told) + 0.1}
+    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": told, **markers})
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    found = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
+    assert found["position"] == ["left_x,left_y,left_z", "right_x,right_y,right_z"]
+
+
+def test_poses_alone(tmp_path: Path, command: Command) -> None:
+    table = write_columns(tmp_path / "t.csv", x_y_z=drawn(9, 3, seed=1))
+    done = command("init", table, "-o", tmp_path / "c.toml")
+    assert done.code == 1
+    assert "expected columns beside its poses, got x, y, z alone" in done.error
+
+
+@pytest.mark.parametrize(("stated", "angle"), [("XYZ", "deg"), ("xyz", "rad"), ("rotvec", "deg")])
+def test_poses_in_another_convention_are_refused_with_the_right_one(
+    stated: str, angle: str, tmp_path: Path, command: Command
+) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    measured = ["--position", "tx,ty,tz", "--rotation", "qx,qy,qz,qw", "--convention", "quat_xyzw", "--camera-on-tool"]
+    pose = ["--robot-pose", f"X,Y,Z,RX,RY,RZ={stated}", "--length", "mm", "--angle", angle]
+    done = command("fit", table, *pose, *measured, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert "the commanded poses fit with --robot-pose X,Y,Z,RX,RY,RZ=xyz --angle deg" in done.err
+
+
+def test_a_quaternion_that_is_none(tmp_path: Path, command: Command) -> None:
+    table = write_columns(tmp_path / "t.csv", x_y_z=drawn(9, 3, seed=1), a_b_c_d=drawn(9, 4, seed=2))
+    given = ["--robot-pose", "x,y,z,a,b,c,d=quat_xyzw", "--position", "x,y,z", "--length", "m", "--angle", "rad"]
+    done = command("fit", table, *given, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert re.search(r"file '.*t\.csv': row 0 of the commanded poses: expected a quaternion", done.error)

@@ -13,12 +13,9 @@ import diffeo_calib as dc
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
 from diffeo_calib.measurements.csv.pose_columns import PoseColumns
-from diffeo_calib.measurements.csv.rotations import EULER
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.poses import ALL_CONVENTIONS, rotation_numbers
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.se3 import transforms
-
-CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
 
 
 def poses(count: int = 12) -> Tensor:
@@ -28,7 +25,7 @@ def poses(count: int = 12) -> Tensor:
     return transforms((skewed - skewed.mT).matrix_exp(), draws[:, :3])
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("convention", ALL_CONVENTIONS)
 @pytest.mark.parametrize(("length", "angle"), [("mm", "deg"), ("m", "rad")])
 def test_there_and_back(convention: str, length: str, angle: str, tmp_path: Path) -> None:
     told = poses()

@@ -34,6 +34,7 @@ from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
@@ -309,10 +310,15 @@ def convention_words(found: Sequence[Convention], columns: Columns | None) -> st
 
 
 def _conventions(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Joint values in another convention; none of a machine that is told poses."""
+    """Joint values, or commanded poses, in another convention."""
+    (columns, table), own = rotations.numeric_table(data), Reading.of(robot, data)
     if is_cartesian(robot):
+        told = None if columns is None else columns.joints
+        if columns is None or not isinstance(told, PoseColumns):
+            return
+        for machine, q, text in told.reread(table, columns.table.joints_per_metre):
+            yield replace(own, robot=machine, q=q, words=f"the commanded poses fit with {text}")
         return
-    columns, own = rotations.numeric_table(data)[0], Reading.of(robot, data)
     found = conventions_of(robot, data, "rad" if columns is None else columns.table.angle)
     for one in found[:1]:
         q = data.q @ one.matrix.mT + one.offset

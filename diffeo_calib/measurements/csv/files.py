@@ -251,7 +251,10 @@ def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numbers of rotations are read as angles
         cells = read_joints(path, replace(columns, robot=None), replace(table, angle="rad", joint_length=None))
-    poses = replace(columns, angle=table.angle).poses(cells)
+    try:
+        poses = replace(columns, angle=table.angle).poses(cells)
+    except MeasurementError as error:
+        raise MeasurementError(f"file '{path}': {error}") from None
     if poses.ndim == 2:
         return poses / table.joints_per_metre
     return transforms(poses[:, :3, :3], poses[:, :3, 3] / table.joints_per_metre)

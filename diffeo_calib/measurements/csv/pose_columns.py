@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, as_written
+from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_written
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.poses import CONVENTIONS, numbers_of, rotation_matrices, rotation_numbers
-from diffeo_calib.robots.cartesian import pose_inputs
+from diffeo_calib.measurements.poses import (
+    ALL_CONVENTIONS,
+    ANGLE_UNITS,
+    CONVENTIONS,
+    numbers_of,
+    rotation_matrices,
+    rotation_numbers,
+)
+from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain
 
@@ -72,8 +82,29 @@ class PoseColumns:
         if not self.convention:
             return cells
         with of_measurements():
-            turns = rotation_matrices(cells[:, 3:], self.convention, angle=self.angle, place="pose {}".format)
+            turns = rotation_matrices(
+                cells[:, 3:], self.convention, angle=self.angle, place="row {} of the commanded poses".format
+            )
         return transforms(turns, cells[:, :3])
+
+    def reread(self, table: Mapping[str, Tensor], per_metre: float) -> Iterator[tuple[Chain, Tensor, str]]:
+        """Machine and joint values (N, n) of these columns in every other convention and unit, and its options.
+
+        Args:
+            table: the columns of a file. per_metre: units of length in the file.
+        """
+        if not self.convention:
+            return
+        cells = torch.stack([table[name] for name in self.columns], 1)
+        cells[:, :3] /= per_metre
+        alike = [name for name in ALL_CONVENTIONS if numbers_of(name) == numbers_of(self.convention)]
+        for convention, angle in product(alike, ANGLE_UNITS):
+            other = replace(self, convention=convention, angle=angle)
+            if (convention, angle) != (self.convention, self.angle):
+                with suppress(DiffeoCalibError):  # numbers that are no rotation in this convention
+                    poses = other.poses(cells)
+                    machine = cartesian(poses)
+                    yield machine, pose_inputs(machine, poses), f"--robot-pose {other.text} --angle {angle}"
 
     def values(self, cells: Tensor) -> Tensor:
         """Cells (N, c) -> joint values (N, n), in the units of the table; without a machine the cells themselves."""

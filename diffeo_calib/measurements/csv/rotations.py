@@ -13,7 +13,7 @@ from diffeo_calib.common.errors import shown
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.pose_frames import POINTS, inverse_poses, points_of_frames, transforms_of_frames
-from diffeo_calib.measurements.poses import is_euler, rotation_matrices
+from diffeo_calib.measurements.poses import EULER, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 
 INVERTED = (
@@ -24,13 +24,6 @@ NOT_INVERTED = (
     "the poses seem to be those of the camera in the board's frame already, or those of a board on the tool that a "
     "fixed camera sees: leave camera_on_tool (--camera-on-tool) out"
 )
-EULER = tuple(
-    order
-    for letters in ("xyz", "XYZ")
-    for order in ("".join((a, b, c)) for a in letters for b in letters for c in letters)
-    if is_euler(order)
-)
-"""The 24 orders of Euler angles."""
 
 
 class Reread(NamedTuple):
