@@ -52,8 +52,10 @@ SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
-MOST_WAYS = 8
+MOST_WAYS = 24
 """Ways to read the rows that are tried with a registration."""
+RANK = 1e-6
+"""Directions of X whose squares are smaller than this share of the largest are open: those along a single axis."""
 ALIKE = 6.0
 """Ways that leave more than so many times what the best one leaves are wrong."""
 
@@ -239,8 +241,9 @@ def _alike(
 ) -> list[tuple[Reading, Reading, bool]]:
     """Ways to read the rotations of both bodies, and whether what stands was seen from the flange, the likeliest first.
 
-    Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: the rotation of X from the
-    axes of both, its shift by linear least squares, and what is left.
+    Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: the rotation of X and its
+    shift by linear least squares (N. Andreff, R. Horaud, B. Espiau, "Robot hand-eye calibration using
+    structure-from-motion", 2001), and what is left.
 
     Args:
         told: places (N, 3), m, of the machine, and its rotations (N, 3, 3) by reading. seen: the same of the other.
@@ -252,7 +255,7 @@ def _alike(
         turns, places = torch.stack([*seen[1].values()])[:, some], seen[0][some]
         shifts = -(turns.mT @ places[:, :, None])[..., 0] if camera else places
         S, u = _motions(shifts, turns.mT if camera else turns)
-        X = nearest_rotations(torch.einsum("aki,bkj->abij", _axes(R), _axes(S)))  # (a, b, 3, 3)
+        X = torch.stack([_conjugation(own, shift, S, u) for own, shift in zip(R, t, strict=True)])  # (a, b, 3, 3)
         turned = R[:, None] @ X[:, :, None] - X[:, :, None] @ S  # (a, b, K, 3, 3)
         G = R - torch.eye(3, dtype=R.dtype, device=R.device)
         right = torch.einsum("abij,bkj->abki", X, u) - t[:, None]
@@ -273,7 +276,18 @@ def _motions(places: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
     return turns, torch.cat([(R.mT @ (later - places)[..., None])[..., 0] for _, later in pairs], 1)
 
 
-def _axes(R: Tensor) -> Tensor:
-    """Axes times sines of the angles of rotations (..., 3, 3): (..., 3)."""
-    D = 0.5 * (R - R.mT)
-    return torch.stack([D[..., 2, 1], D[..., 0, 2], D[..., 1, 0]], -1)
+def _conjugation(R: Tensor, t: Tensor, S: Tensor, u: Tensor) -> Tensor:
+    """Rotations (b, 3, 3) of X with A X = X B, also where all turns are about one axis.
+
+    Args:
+        R: (K, 3, 3) and t: (K, 3), m, of A. S: (b, K, 3, 3) and u: (b, K, 3), m, of b readings of B.
+    """
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    turns = torch.einsum("kip,jq->kijpq", R, eye) - torch.einsum("ip,bkqj->bkijpq", eye, S)
+    shifts = torch.einsum("ip,bkq->bkipq", eye, u) / t.norm(dim=1).mean()
+    by_shift = ((eye - R) / t.norm(dim=1).mean()).expand(len(S), -1, -1, -1).flatten(1, 2)  # (b, 3 K, 3)
+    rows = torch.cat([shifts.flatten(3).flatten(1, 2), by_shift], 2)
+    rows = torch.cat([torch.nn.functional.pad(turns.flatten(4).flatten(1, 3), (0, 3)), rows], 1)  # (b, 12 K, 12)
+    wanted = torch.cat([t.new_zeros(9 * len(t)), (t / t.norm(dim=1).mean()).flatten()])
+    found = torch.linalg.pinv(rows.mT @ rows, rtol=RANK, hermitian=True) @ (rows.mT @ wanted)[..., None]
+    return nearest_rotations(found[:, :9, 0].unflatten(1, (3, 3)))
