@@ -1,0 +1,258 @@
+"""What do commanded poses and places tell, without joint values? Hand-eye transforms, and error fields of machines.
+
+    python benchmarks/robustness/told_machines.py --seeds 10 --out told_machines.json
+
+`hand-eye`: a camera on the flange sees a board (0.1 mm and 0.3 mrad of noise); the arm is off by a smooth random field
+over its poses of 0, 0.3 or 1 mm (and twice as many mrad). Peers that take the arm to be perfect: least squares over
+camera and board (SciPy), weighted by the true noise, and, where OpenCV 4 is installed, the five methods of
+`calibrateHandEye`. Errors are those of the camera in the flange, and of the camera's place at 200 other poses.
+`gantry`, `delta`, `small`: a machine of 1 m out of square and bent; a delta robot with wrong lengths and zeros; smooth
+random errors within 0.2 m. Measured places have 0.05 mm of noise a coordinate; errors are those of 500 other places.
+
+Fields of a record: `machine`, `rows`, `arm_mm`, `seed`; `before_mm` of the machine as it is, `after_mm` of the model at
+new places, `inside` share of these in 95 % regions; `camera_mm` of the hand-eye transform, `sigmas` the largest of its
+errors in standard deviations, `inside_camera` share of its six numbers within 1.96; `peer_mm`, `peer_after_mm` of least
+squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+
+import argparse
+import warnings
+from collections.abc import Callable, Iterator
+
+import harness
+import numpy as np
+import torch
+from harness import Record
+from held_out import covered
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.kinematics.hand_eye import HandEye
+
+COLUMNS = ("machine", "rows", "arm_mm", "seed", "before_mm", "after_mm", "inside", "camera_mm", "sigmas")
+COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm")
+SHIFT_NOISE_M, TURN_NOISE_RAD, PLACE_NOISE_M = 1e-4, 3e-4, 5e-5
+NEW_POSES, NEW_PLACES = 200, 500
+Poses = NDArray[np.float64]
+"""(N, 4, 4), m; or places (N, 3), m."""
+ErrorOf = Callable[[Poses], Poses]
+
+
+def transform(turn: object, place: object = (0.0, 0.0, 0.0)) -> Poses:
+    """(..., 4, 4) of rotation vectors, rad, and places, m."""
+    turn, place = np.broadcast_arrays(np.asarray(turn, float), np.asarray(place, float))
+    found = np.zeros((*turn.shape[:-1], 4, 4))
+    found[..., :3, :3] = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape[:-1], 3, 3)
+    found[..., :3, 3], found[..., 3, 3] = place, 1.0
+    return found
+
+
+CAMERA, BOARD = transform((0.06, -0.08, 0.7), (0.03, -0.06, 0.05)), transform((0.03, 0.02, 0.35), (0.6, 0.02, 0.01))
+DOWN = Rotation.from_euler("x", 180.0, degrees=True)
+
+
+def waves(rng: np.random.Generator, inputs: int, outputs: int, per_unit: float) -> ErrorOf:
+    """A smooth random field of unit size in each output, as a sum of six waves."""
+    rates, phases = per_unit * rng.normal(size=(6, inputs)), rng.uniform(0.0, 2.0 * np.pi, 6)
+    sizes = rng.normal(size=(6, outputs)) / 3.0**0.5
+    return lambda x: np.sin(x @ rates.T + phases) @ sizes
+
+
+def flange_poses(rng: np.random.Generator, count: int) -> Poses:
+    """A flange that looks at the board, from 0.35 to 0.6 m away, tilted and turned."""
+    angles = np.concatenate([rng.uniform(-35.0, 35.0, (count, 2)), rng.uniform(-90.0, 90.0, (count, 1))], 1)
+    turns = (DOWN * Rotation.from_euler("xyz", angles, degrees=True)).as_matrix()
+    away = rng.uniform(0.35, 0.6, (count, 1)) * turns[:, :, 2]
+    found = transform(np.zeros((count, 3)), (0.6, 0.0, 0.0) - away + rng.uniform(-0.08, 0.08, (count, 3)))
+    found[:, :3, :3] = turns
+    return found
+
+
+def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
+    """One camera on the flange of one arm."""
+    rng = np.random.default_rng(seed)
+    field = waves(rng, 6, 6, 2.0)
+
+    def true(poses: Poses) -> Poses:
+        error = 1e-3 * arm_mm * field(np.concatenate([poses[:, :3, 3], (DOWN.inv() * turns_of(poses)).as_rotvec()], 1))
+        found = transform(2.0 * error[:, 3:])
+        found[:, :3, :3] = found[:, :3, :3] @ poses[:, :3, :3]
+        found[:, :3, 3] = poses[:, :3, 3] + error[:, :3]
+        return found
+
+    told, new = flange_poses(rng, rows), flange_poses(rng, NEW_POSES)
+    exact = np.linalg.inv(true(told) @ CAMERA) @ BOARD
+    seen = transform(TURN_NOISE_RAD * rng.normal(size=(rows, 3))) @ exact
+    seen[:, :3, 3] = exact[:, :3, 3] + SHIFT_NOISE_M * rng.normal(size=(rows, 3))
+    machine = dc.cartesian(told)
+    q, boards = dc.pose_inputs(machine, told), torch.from_numpy(seen)
+    model = dc.calibrate(machine, dc.Measurements.from_poses(q, boards, camera_on_tool=True, doubt=False)).model
+    camera = HandEye.of(model).camera
+    away = np.concatenate([(camera.pose[:3, 3].numpy() - CAMERA[:3, 3]), turn_between(camera.pose.numpy(), CAMERA)])
+    sigmas = np.abs(away) / camera.deviations.numpy()
+    there = np.linalg.inv(BOARD) @ true(new) @ CAMERA  # the camera, seen from the board
+    mean, covariance = model.predict_poses(dc.pose_inputs(machine, new), noise=False)
+    shifts = torch.from_numpy(there[:, None, :3, 3]) - mean[:, None, :3, 3]
+    peer, board = squares(told, seen)
+    nominal = (np.linalg.inv(board) @ new @ peer)[:, :3, 3] - there[:, :3, 3]
+    return {
+        "machine": "hand-eye",
+        **{"rows": rows, "arm_mm": arm_mm, "seed": seed, "before_mm": None},
+        "after_mm": 1e3 * rms(shifts[:, 0].numpy()),
+        "inside": covered(shifts, covariance[:, None, :3, :3]),
+        "camera_mm": 1e3 * float(np.linalg.norm(away[:3])),
+        "sigmas": float(sigmas.max()),
+        "inside_camera": float((sigmas < 1.96).mean()),
+        "peer_mm": 1e3 * float(np.linalg.norm(peer[:3, 3] - CAMERA[:3, 3])),
+        "peer_after_mm": 1e3 * rms(nominal),
+        "opencv_mm": best_of_opencv(told, seen),
+    }
+
+
+def turns_of(poses: Poses) -> Rotation:
+    """Rotations of poses."""
+    return Rotation.from_matrix(poses[..., :3, :3])
+
+
+def turn_between(first: Poses, second: Poses) -> Poses:
+    """(..., 3) rotation vectors, rad."""
+    return (turns_of(first) * turns_of(second).inv()).as_rotvec()
+
+
+def squares(told: Poses, seen: Poses) -> tuple[Poses, Poses]:
+    """Camera in the flange and board in the base by least squares from the truth, which is the peer's best case."""
+
+    def left(x: Poses) -> Poses:
+        camera, board = CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
+        expected = np.linalg.inv(told @ camera) @ board
+        shift = (expected - seen)[:, :3, 3] / SHIFT_NOISE_M
+        return np.concatenate([shift, turn_between(expected, seen) / TURN_NOISE_RAD]).ravel()
+
+    x = least_squares(left, np.zeros(12), x_scale="jac").x
+    return CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
+
+
+def best_of_opencv(told: Poses, seen: Poses) -> float | None:
+    """Error of the best of OpenCV 4's methods, mm; OpenCV 5 has none."""
+    try:
+        import cv2  # noqa: PLC0415  # optional
+    except ImportError:
+        return None
+    if not hasattr(cv2, "calibrateHandEye"):
+        return None
+    split = [list(each) for own in (told, seen) for each in (own[:, :3, :3], own[:, :3, 3])]
+    found = [cv2.calibrateHandEye(*split, method=method)[1][:, 0] for method in range(5)]
+    return 1e3 * min(float(np.linalg.norm(place - CAMERA[:3, 3])) for place in found)
+
+
+def rms(errors: Poses) -> float:
+    """Of vectors (N, 3)."""
+    return float(np.sqrt((errors**2).sum(1).mean()))
+
+
+def gantry(rng: np.random.Generator) -> tuple[ErrorOf, ErrorOf]:
+    """Errors (N, 3) of places (N, 3), m, and places of draws in the unit cube."""
+    size, bent, skew = np.array([1.0, 0.8, 0.4]), waves(rng, 3, 3, 6.0), 6e-4 * rng.normal(size=(3, 3))
+    return lambda x: (x - size / 2) @ skew.T + 3e-4 * bent(x), lambda draws: size * draws
+
+
+def small(rng: np.random.Generator) -> tuple[ErrorOf, ErrorOf]:
+    """The same of smooth random errors within 0.2 m."""
+    field = waves(rng, 3, 3, 18.0)
+    return lambda x: 6e-4 * field(x), lambda draws: 0.2 * draws - 0.1
+
+
+def delta(rng: np.random.Generator) -> tuple[ErrorOf, ErrorOf]:
+    """The same of a delta robot: where it goes with the joint values of its nominal lengths."""
+    wrong = {"upper": 5e-4 * rng.normal(size=3), "lower": 5e-4 * rng.normal(size=3)}
+    wrong |= {"base": 5e-4 * rng.normal(size=3), "zero": 1e-3 * rng.normal(size=3)}
+    right = {name: np.zeros(3) for name in wrong}
+
+    def error(x: Poses) -> Poses:
+        joints, place = delta_joints(x, right), x.copy()
+        for _ in range(20):  # Newton's steps
+            steps = [delta_joints(place + h, wrong) - delta_joints(place - h, wrong) for h in 1e-6 * np.eye(3)]
+            slopes = np.stack(steps, 2) / 2e-6
+            place = place - np.linalg.solve(slopes, (delta_joints(place, wrong) - joints)[..., None])[..., 0]
+        return place - x
+
+    def places(draws: Poses) -> Poses:
+        radius, turn = 0.35 * np.sqrt(draws[:, 0]), 2.0 * np.pi * draws[:, 1]
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn), -0.55 - 0.25 * draws[:, 2]], 1)
+
+    return error, places
+
+
+def delta_joints(place: Poses, error: dict[str, Poses]) -> Poses:
+    """Joint values (N, 3), rad, of a platform's places (N, 3), m: arms of 0.3 and 0.7 m at radii of 0.2 and 0.05 m."""
+    found = []
+    for k in range(3):
+        c, s = np.cos(2.0 * np.pi * k / 3.0), np.sin(2.0 * np.pi * k / 3.0)
+        x, y = place[:, 0] * c + place[:, 1] * s + 0.05 - 0.2 - error["base"][k], place[:, 1] * c - place[:, 0] * s
+        upper, lower = 0.3 + error["upper"][k], 0.7 + error["lower"][k]
+        C, S = -2.0 * upper * x, 2.0 * upper * place[:, 2]
+        h = lower**2 - x**2 - y**2 - place[:, 2] ** 2 - upper**2
+        middle, half = np.arctan2(S, C), np.arccos(np.clip(h / np.hypot(C, S), -1.0, 1.0))
+        outward = np.cos(middle - half) > np.cos(middle + half)
+        found.append(np.where(outward, middle - half, middle + half) + error["zero"][k])
+    return np.stack(found, 1)
+
+
+MACHINES = {"gantry": gantry, "delta": delta, "small": small}
+
+
+def field(machine: str, rows: int, seed: int) -> Record:
+    """One machine that is told places."""
+    rng = np.random.default_rng(seed)
+    error, places = MACHINES[machine](rng)
+    told, new = (places(rng.uniform(size=(count, 3))) for count in (rows, NEW_PLACES))
+    device = transform((0.1, 0.2, -0.3), (1.0, 2.0, 0.3))
+    seen = (told + error(told)) @ device[:3, :3].T + device[:3, 3] + PLACE_NOISE_M * rng.normal(size=(rows, 3))
+    robot = dc.cartesian(told)
+    data = dc.Measurements(dc.pose_inputs(robot, told), torch.from_numpy(seen), doubt=False)
+    model = dc.calibrate(robot, data).model
+    true: Tensor = torch.from_numpy((new + error(new)) @ device[:3, :3].T + device[:3, 3])
+    mean, covariance = model.predict(dc.pose_inputs(robot, new), noise=False)
+    away, before = true[:, None] - mean, error(new)
+    return {
+        **{"machine": machine, "rows": rows, "arm_mm": None, "seed": seed},
+        "before_mm": 1e3 * rms(before - before.mean(0)),
+        "after_mm": 1e3 * rms(away[:, 0].numpy()),
+        "inside": covered(away, covariance),
+        **dict.fromkeys(COLUMNS[7:]),
+    }
+
+
+def measure(arguments: argparse.Namespace) -> Iterator[Record]:
+    """Yield one record for every machine, number of rows and seed."""
+    seeds = 1 if arguments.quick else arguments.seeds
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
+        for rows in (20,) if arguments.quick else (10, 20, 40, 80):
+            for arm_mm in (0.3,) if arguments.quick else (0.0, 0.3, 1.0):
+                yield from (hand_eye(rows, arm_mm, seed) for seed in range(seeds))
+        for machine in MACHINES:
+            for rows in (40,) if arguments.quick else (100, 400):
+                yield from (field(machine, rows, seed) for seed in range(seeds))
+
+
+def main() -> None:
+    """Parse the arguments and measure."""
+    parser = harness.parser(__doc__)
+    parser.add_argument("--seeds", type=harness.count, default=10, metavar="N", help="machines of each kind")
+    arguments = parser.parse_args()
+    harness.guarded(lambda: harness.report(measure(arguments), arguments.out, COLUMNS) and None)
+
+
+if __name__ == "__main__":
+    main()
