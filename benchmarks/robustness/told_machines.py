@@ -25,6 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all b
 import argparse
 import warnings
 from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any
 
 import harness
 import numpy as np
@@ -145,7 +147,7 @@ def squares(told: Poses, seen: Poses) -> tuple[Poses, Poses]:
 def best_of_opencv(told: Poses, seen: Poses) -> float | None:
     """Error of the best of OpenCV 4's methods, mm; OpenCV 5 has none."""
     try:
-        import cv2  # noqa: PLC0415  # optional
+        cv2: Any = import_module("cv2")  # optional
     except ImportError:
         return None
     if not hasattr(cv2, "calibrateHandEye"):
@@ -251,7 +253,11 @@ def main() -> None:
     parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=harness.count, default=10, metavar="N", help="machines of each kind")
     arguments = parser.parse_args()
-    harness.guarded(lambda: harness.report(measure(arguments), arguments.out, COLUMNS) and None)
+    harness.guarded(lambda: _report(arguments))
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    harness.report(measure(arguments), arguments.out, COLUMNS)
 
 
 if __name__ == "__main__":
