@@ -158,7 +158,7 @@ class EvaluateOptions(Command):
 class InitOptions(Command):
     """Propose the options of `fit` for a table and a robot.
 
-    Without ROBOT the table has poses, or places, that a machine was told in place of joint values. Looks at names,
+    Without ROBOT the table has commanded poses or places in place of joint values. Looks at names,
     numbers and plausible units, and writes a campaign file with a reason for every line. Check it, then
     run `diffeo-calib fit campaign.toml`.
     """
@@ -286,7 +286,7 @@ class ExportOptions(Command):
     torch: Path | None = written("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
     onnx: Path | None = written("The same for onnxruntime; needs the packages onnx and onnxscript.", "ONNX")
     field: Path | None = written(
-        "Of a machine that is told places: what to add to its commands at the places of --grid.", "CSV"
+        "Of a machine with commanded places: what to add to its commands at the places of --grid.", "CSV"
     )
     grid: str = option("Points of --field along each axis.", "NXxNYxNZ", default="5x5x5")
     camera: Path | None = option(

@@ -50,7 +50,7 @@ def load_robot(path: Path, links: Links) -> Tree:
 
 
 def robot_of(given: Robot, source: MeasuredTable) -> Tree:
-    """The robot of a table: that of a file, or a machine that was told the poses of the table."""
+    """The robot of a table: that of a file, or a machine whose commanded poses are in the table."""
     if isinstance(source.joints, PoseColumns):
         if given.robot is not None or any(vars(given.links).values()):
             what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"

@@ -89,7 +89,7 @@ class Units:
         "A,B,...",
     )
     robot_pose: str | None = option(
-        "Columns of the place or pose to which the machine was told to go, as its controller writes it, in place of "
+        "Columns of the commanded place or pose, as the controller writes it, in place of "
         "joint values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the "
         "unit of --angle.",
         "X,Y,Z[,...]",
@@ -203,7 +203,7 @@ class Links:
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """Which robot was measured; none where --robot-pose says where it was told to go."""
+    """Which robot was measured; none where --robot-pose names commanded poses."""
 
     robot: Path | None = option(ROBOT, "FILE")
     links: Links

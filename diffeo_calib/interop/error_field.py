@@ -1,4 +1,4 @@
-"""The error field of a machine that is told places: corrections of its commands on a grid."""
+"""The error field of a machine with commanded places: corrections of its commands on a grid."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     along the axes of the machine.
 
     Args:
-        model: of a machine that is told places or poses, see :func:`diffeo_calib.cartesian`.
+        model: of a machine with commanded places or poses, see :func:`diffeo_calib.cartesian`.
         grid: numbers of points along each axis, such as "5x5x3". length: unit in the file.
 
     Raises:
@@ -35,7 +35,7 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     axes = min(robot.n, len(SLIDES))
     if not is_cartesian(robot):
         fix = "calibrate with --robot-pose, or correct a program with `correct`"
-        raise InputError.of("an error field", expected="a machine that is told places", got=robot.name, fix=fix)
+        raise InputError.of("an error field", expected="a machine with commanded places", got=robot.name, fix=fix)
     if len(counts) != axes or min(counts) < 2:
         expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}"
         raise InputError.of(f"--grid {grid}", expected=expected)

@@ -1,11 +1,11 @@
-"""Machines that are told where to go: the numbers of a pose, or of a place, take the place of joint values.
+"""Machines with commanded poses or places: these numbers take the place of joint values.
 
 The nominal kinematics are the identity, k0(p) = p, written as a chain: three slides along x, y and z, a constant
 rotation M, and turns about z, y and x,
 
     pose(p) = T(x, y, z) M R_z(a) R_y(b) R_x(c).
 
-M is the middle of the poses, or turned so that b stays far from +-90 degrees, where a and c are not told apart.
+M is the middle of the poses, or turned so that b stays far from +-90 degrees, where a and c are not distinct.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TOLERANCE = 1e-3
 
 
 def cartesian(poses: object) -> Chain:
-    """A machine whose input is the pose, or the place, to which it is told to go.
+    """A machine whose input is a commanded pose, or a commanded place.
 
     Args:
         poses: (N, 4, 4) rigid transforms, or (N, k) places of k = 1, 2 or 3 coordinates, m: those of the rows that will
@@ -66,7 +66,7 @@ def pose_inputs(robot: Tree, poses: object) -> Tensor:
         InputError: poses of another kind than those of the robot, or farther from their middle than it can tell.
     """
     if not is_cartesian(robot):
-        raise RobotError.of(f"robot '{robot.name}'", expected="a machine that is told poses, see dc.cartesian")
+        raise RobotError.of(f"robot '{robot.name}'", expected="a machine with commanded poses, see dc.cartesian")
     given = _checked(poses)
     if (given.ndim == 3) != (robot.n == 6) or (given.ndim == 2 and given.shape[1] != robot.n):
         expected = "(N, 4, 4)" if robot.n == 6 else f"(N, {robot.n})"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import get_ur10_data
 import torch
+from commanded_bank import bent, drawn, flange, seen, write_columns
 from product_bank import simulated, simulated_poses
-from told_bank import bent, drawn, flange, seen, write_columns
 from trackerless_bank import write_socket_table, write_wire_table
 
 import diffeo_calib as dc
@@ -48,18 +48,18 @@ def write_tables(place: Path, rows: int = 100) -> None:
     posed = simulated_poses(30)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
     write_measurements(place / "poses.csv", posed, rotation)
-    write_told_tables(place)
+    write_commanded_tables(place)
     source = os.environ.get("DIFFEO_CALIB_DATA")
     if source:
         get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
 
 
-def write_told_tables(place: Path) -> None:
+def write_commanded_tables(place: Path) -> None:
     """Of flange poses with those of a board, and of places of a gantry."""
-    told = flange()
-    hand_eye = seen(told, camera_on_tool=True)
-    turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((told, ("xyz",)), (hand_eye, ("quat_xyzw",)))]
-    poses = {"X_Y_Z": 1e3 * told[:, :3, 3], "RX_RY_RZ": turns[0].rad2deg()}
+    commanded = flange()
+    hand_eye = seen(commanded, camera_on_tool=True)
+    turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (hand_eye, ("quat_xyzw",)))]
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0].rad2deg()}
     write_columns(place / "flange.csv", **poses, tx_ty_tz=1e3 * hand_eye[:, :3, 3], qx_qy_qz_qw=turns[1])
     places = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     write_columns(

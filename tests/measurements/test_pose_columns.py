@@ -1,4 +1,4 @@
-"""Columns of the poses that a machine was told: all conventions and units, there and back."""
+"""Columns of commanded poses: all conventions and units, there and back."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ def poses(count: int = 12) -> Tensor:
 @pytest.mark.parametrize("convention", ALL_CONVENTIONS)
 @pytest.mark.parametrize(("length", "angle"), [("mm", "deg"), ("m", "rad")])
 def test_there_and_back(convention: str, length: str, angle: str, tmp_path: Path) -> None:
-    told = poses()
-    turns = rotation_numbers(told[:, :3, :3], convention, angle=angle)
-    cells = torch.cat([UNITS_PER_METRE[length] * told[:, :3, 3], turns], 1)
+    commanded = poses()
+    turns = rotation_numbers(commanded[:, :3, :3], convention, angle=angle)
+    cells = torch.cat([UNITS_PER_METRE[length] * commanded[:, :3, 3], turns], 1)
     names = [f"c{k}" for k in range(cells.shape[1])]
-    path = tmp_path / "told.csv"
+    path = tmp_path / "commanded.csv"
     lines = [",".join(map(repr, row)) for row in cells.tolist()]
     path.write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
     columns, table = PoseColumns.of(f"{','.join(names)}={convention}"), TableFormat(length, angle)
-    assert_close(read_poses(path, columns, table), told, rtol=0, atol=1e-12)
-    robot = dc.cartesian(told)
+    assert_close(read_poses(path, columns, table), commanded, rtol=0, atol=1e-12)
+    robot = dc.cartesian(commanded)
     own = PoseColumns(columns.columns, convention, robot)
     q = read_joints(path, own, table)
-    assert_close(robot(q), told, rtol=0, atol=1e-12)
+    assert_close(robot(q), commanded, rtol=0, atol=1e-12)
     again = Columns.of(table.joints_only(own)).joints_from_si(q)
     back = PoseColumns(columns.columns, convention, angle=angle).poses(again)
-    assert_close(back[:, :3, :3], told[:, :3, :3], rtol=0, atol=1e-12)
+    assert_close(back[:, :3, :3], commanded[:, :3, :3], rtol=0, atol=1e-12)
     assert_close(again[:, :3], cells[:, :3], rtol=1e-12, atol=1e-12)
 
 
 def test_rows_without_a_command_stay_empty() -> None:
-    told = poses()
-    own = PoseColumns(tuple("xyzabc"), "xyz", dc.cartesian(told))
-    q = dc.pose_inputs(dc.cartesian(told), told)
+    commanded = poses()
+    own = PoseColumns(tuple("xyzabc"), "xyz", dc.cartesian(commanded))
+    q = dc.pose_inputs(dc.cartesian(commanded), commanded)
     q[2] = torch.nan
     cells = own.cells(q)
     assert bool(cells[2].isnan().all())

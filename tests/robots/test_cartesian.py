@@ -1,4 +1,4 @@
-"""Machines that are told poses or places: the identity as a chain, wherever the poses are."""
+"""Machines with commanded poses or places: the identity as a chain, wherever the poses are."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def poses(count: int = 30, *, spread: float = 0.5, seed: int = 0) -> Tensor:
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.5])
-def test_the_robot_goes_where_it_is_told(spread: float) -> None:
-    told = poses(spread=spread)
-    robot = dc.cartesian(told)
-    q = dc.pose_inputs(robot, told)
-    assert_close(robot(q), told, rtol=0, atol=1e-12)
+def test_the_robot_goes_where_it_is_commanded(spread: float) -> None:
+    commanded = poses(spread=spread)
+    robot = dc.cartesian(commanded)
+    q = dc.pose_inputs(robot, commanded)
+    assert_close(robot(q), commanded, rtol=0, atol=1e-12)
     low, high = robot.limits.unbind(1)
     assert bool(((q >= low) & (q <= high)).all())
     assert float(q[:, 4].sin().abs().max()) < 0.97
@@ -44,9 +44,9 @@ def test_orientations_all_around_one_axis_and_far_about_another() -> None:
     """A wrist that turns all around while it tilts by up to a quarter turn: the mean would be next to a singularity."""
     angles = torch.linspace(-torch.pi, torch.pi, 25, dtype=torch.float64)
     axes = torch.stack([torch.zeros_like(angles), angles, torch.zeros_like(angles)], 1)
-    told = transforms(turns(axes), torch.zeros_like(axes))
-    robot = dc.cartesian(told)
-    assert_close(robot(dc.pose_inputs(robot, told)), told, rtol=0, atol=1e-12)
+    commanded = transforms(turns(axes), torch.zeros_like(axes))
+    robot = dc.cartesian(commanded)
+    assert_close(robot(dc.pose_inputs(robot, commanded)), commanded, rtol=0, atol=1e-12)
 
 
 def test_orientations_that_no_middle_holds() -> None:
@@ -64,19 +64,19 @@ def test_places(axes: int) -> None:
 
 
 def test_a_model_file_keeps_the_machine() -> None:
-    told = poses()
-    robot = dc.cartesian(told)
+    commanded = poses()
+    robot = dc.cartesian(commanded)
     again = robot_from_config(robot.to_config())
-    assert_close(dc.pose_inputs(again, told), dc.pose_inputs(robot, told), rtol=0, atol=0)
+    assert_close(dc.pose_inputs(again, commanded), dc.pose_inputs(robot, commanded), rtol=0, atol=0)
 
 
 def test_bad_poses() -> None:
-    robot, told = dc.cartesian(poses()), poses()
-    told[3, :3, :3] *= 1.1
+    robot, commanded = dc.cartesian(poses()), poses()
+    commanded[3, :3, :3] *= 1.1
     with pytest.raises(dc.DiffeoCalibError, match="`poses`, row 3: expected a rigid transform"):
-        dc.cartesian(told)
+        dc.cartesian(commanded)
     with pytest.raises(dc.DiffeoCalibError, match=r"`poses`: expected \(N, 4, 4\), got \(30, 3\)"):
         dc.pose_inputs(robot, poses()[:, :3, 3])
     arm = dc.from_dh([dc.DHRow(a=1.0, alpha=0.0, d=0.0, theta=0.0)])
-    with pytest.raises(dc.DiffeoCalibError, match="expected a machine that is told poses"):
+    with pytest.raises(dc.DiffeoCalibError, match="expected a machine with commanded poses"):
         dc.pose_inputs(arm, poses())

@@ -313,10 +313,10 @@ def _conventions(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values, or commanded poses, in another convention."""
     (columns, table), own = rotations.numeric_table(data), Reading.of(robot, data)
     if is_cartesian(robot):
-        told = None if columns is None else columns.joints
-        if columns is None or not isinstance(told, PoseColumns):
+        pose = None if columns is None else columns.joints
+        if columns is None or not isinstance(pose, PoseColumns):
             return
-        for machine, q, text in told.reread(table, columns.table.joints_per_metre):
+        for machine, q, text in pose.reread(table, columns.table.joints_per_metre):
             yield replace(own, robot=machine, q=q, words=f"the commanded poses fit with {text}")
         return
     found = conventions_of(robot, data, "rad" if columns is None else columns.table.angle)

@@ -122,7 +122,7 @@ class _Export:
         return {folder / name: text.encode() for name, text in files.items()}
 
     def field(self) -> None:
-        """Corrections of commands on a grid, of a machine that is told places."""
+        """Corrections of commands on a grid, of a machine with commanded places."""
         self.files["--field"] = field_text(self.model, self.given.grid, self.length).encode()
         self.lines.append(
             "field: a controller adds add_x, ... to the place that it is to reach; std_x, ... say how well"

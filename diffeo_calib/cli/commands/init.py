@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any, NamedTuple, get_args
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
-from diffeo_calib.cli import proposals, told_poses
+from diffeo_calib.cli import commanded_poses, proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
@@ -76,7 +76,7 @@ def run(given: InitOptions) -> None:
     sheet = guess_sheet(csv)
     choices = [Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])), *joined]
     try:
-        choices += _told(csv, given.robot, output, sheet) or _choices(csv, given.robot or Path(), output, sheet)
+        choices += _commanded(csv, given.robot, output, sheet) or _choices(csv, given.robot or Path(), output, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -124,7 +124,7 @@ def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Cho
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
-def _told(csv: Path, robot: Path | None, output: Path, sheet: Sheet) -> list[Choice]:
+def _commanded(csv: Path, robot: Path | None, output: Path, sheet: Sheet) -> list[Choice]:
     """Entries of a table with poses of the machine; none where a robot is named whose joints the table has."""
     left = list[Choice]()
     if robot is not None:
@@ -132,14 +132,14 @@ def _told(csv: Path, robot: Path | None, output: Path, sheet: Sheet) -> list[Cho
             _arms(robot, sheet)
         except InputError as error:
             try:
-                source, columns, units = told_poses.choices(csv, sheet)
+                source, columns, units = commanded_poses.choices(csv, sheet)
             except DiffeoCalibError:
                 raise error from None
             left = [Choice("", "", f"{robot}: not used, no column is named after its joints")]
         else:
             return []
     else:
-        source, columns, units = told_poses.choices(csv, sheet)
+        source, columns, units = commanded_poses.choices(csv, sheet)
     entries = (choice._replace(value=_from_folder(choice.value, output.parent)) for choice in source.rows.entries())
     sep = Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     files = Choice("output", csv.with_suffix(".safetensors").name, "the model")

@@ -54,7 +54,9 @@ def run(given: PredictOptions) -> None:
     else:
         check_payload_column(kinematics, table.payload)
     prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(names, robot.kinds)
-    if {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"} & {*Columns.of(columns).names}:  # of told places
+    if {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"} & {
+        *Columns.of(columns).names
+    }:  # commanded places have these names
         prefixes = tuple(f"predicted_{prefix}" for prefix in prefixes)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     values = read_configurations(given.csv, names, table, kinds=robot.kinds)

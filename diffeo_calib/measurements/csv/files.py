@@ -247,7 +247,7 @@ def read_configurations(
 
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
-    """The poses (N, 4, 4), or places (N, k), m, to which a machine was told to go."""
+    """The poses (N, 4, 4), or places (N, k), m, to which a machine was commanded."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numbers of rotations are read as angles
         cells = read_joints(path, replace(columns, robot=None), replace(table, angle="rad", joint_length=None))

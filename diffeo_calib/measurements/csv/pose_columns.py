@@ -1,4 +1,4 @@
-"""Columns of the pose to which a machine was told to go, as its controller writes it, in place of joint values."""
+"""Columns of a machine's commanded pose, as its controller writes it, in place of joint values."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """What do commanded poses and places tell, without joint values? Hand-eye transforms, and error fields of machines.
 
-    python benchmarks/robustness/told_machines.py --seeds 10 --out told_machines.json
+    python benchmarks/robustness/commanded_machines.py --seeds 10 --out commanded_machines.json
 
 `hand-eye`: a camera on the flange sees a board (0.1 mm and 0.3 mrad of noise); the arm is off by a smooth random field
 over its poses of 0, 0.3 or 1 mm (and twice as many mrad). Peers that take the arm to be perfect: least squares over
@@ -92,12 +92,12 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
         found[:, :3, 3] = poses[:, :3, 3] + error[:, :3]
         return found
 
-    told, new = flange_poses(rng, rows), flange_poses(rng, NEW_POSES)
-    exact = np.linalg.inv(true(told) @ CAMERA) @ BOARD
+    commanded, new = flange_poses(rng, rows), flange_poses(rng, NEW_POSES)
+    exact = np.linalg.inv(true(commanded) @ CAMERA) @ BOARD
     seen = transform(TURN_NOISE_RAD * rng.normal(size=(rows, 3))) @ exact
     seen[:, :3, 3] = exact[:, :3, 3] + SHIFT_NOISE_M * rng.normal(size=(rows, 3))
-    machine = dc.cartesian(told)
-    q, boards = dc.pose_inputs(machine, told), torch.from_numpy(seen)
+    machine = dc.cartesian(commanded)
+    q, boards = dc.pose_inputs(machine, commanded), torch.from_numpy(seen)
     model = dc.calibrate(machine, dc.Measurements.from_poses(q, boards, camera_on_tool=True, doubt=False)).model
     camera = HandEye.of(model).camera
     away = np.concatenate([(camera.pose[:3, 3].numpy() - CAMERA[:3, 3]), turn_between(camera.pose.numpy(), CAMERA)])
@@ -105,7 +105,7 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
     there = np.linalg.inv(BOARD) @ true(new) @ CAMERA  # the camera, seen from the board
     mean, covariance = model.predict_poses(dc.pose_inputs(machine, new), noise=False)
     shifts = torch.from_numpy(there[:, None, :3, 3]) - mean[:, None, :3, 3]
-    peer, board = squares(told, seen)
+    peer, board = squares(commanded, seen)
     nominal = (np.linalg.inv(board) @ new @ peer)[:, :3, 3] - there[:, :3, 3]
     return {
         "machine": "hand-eye",
@@ -117,7 +117,7 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
         "inside_camera": float((sigmas < 1.96).mean()),
         "peer_mm": 1e3 * float(np.linalg.norm(peer[:3, 3] - CAMERA[:3, 3])),
         "peer_after_mm": 1e3 * rms(nominal),
-        "opencv_mm": best_of_opencv(told, seen),
+        "opencv_mm": best_of_opencv(commanded, seen),
     }
 
 
@@ -131,12 +131,12 @@ def turn_between(first: Poses, second: Poses) -> Poses:
     return (turns_of(first) * turns_of(second).inv()).as_rotvec()
 
 
-def squares(told: Poses, seen: Poses) -> tuple[Poses, Poses]:
+def squares(commanded: Poses, seen: Poses) -> tuple[Poses, Poses]:
     """Camera in the flange and board in the base by least squares from the truth, which is the peer's best case."""
 
     def left(x: Poses) -> Poses:
         camera, board = CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
-        expected = np.linalg.inv(told @ camera) @ board
+        expected = np.linalg.inv(commanded @ camera) @ board
         shift = (expected - seen)[:, :3, 3] / SHIFT_NOISE_M
         return np.concatenate([shift, turn_between(expected, seen) / TURN_NOISE_RAD]).ravel()
 
@@ -144,7 +144,7 @@ def squares(told: Poses, seen: Poses) -> tuple[Poses, Poses]:
     return CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
 
 
-def best_of_opencv(told: Poses, seen: Poses) -> float | None:
+def best_of_opencv(commanded: Poses, seen: Poses) -> float | None:
     """Error of the best of OpenCV 4's methods, mm; OpenCV 5 has none."""
     try:
         cv2: Any = import_module("cv2")  # optional
@@ -152,7 +152,7 @@ def best_of_opencv(told: Poses, seen: Poses) -> float | None:
         return None
     if not hasattr(cv2, "calibrateHandEye"):
         return None
-    split = [list(each) for own in (told, seen) for each in (own[:, :3, :3], own[:, :3, 3])]
+    split = [list(each) for own in (commanded, seen) for each in (own[:, :3, :3], own[:, :3, 3])]
     found = [cv2.calibrateHandEye(*split, method=method)[1][:, 0] for method in range(5)]
     return 1e3 * min(float(np.linalg.norm(place - CAMERA[:3, 3])) for place in found)
 
@@ -214,14 +214,16 @@ MACHINES = {"gantry": gantry, "delta": delta, "small": small}
 
 
 def field(machine: str, rows: int, seed: int) -> Record:
-    """One machine that is told places."""
+    """One machine with commanded places."""
     rng = np.random.default_rng(seed)
     error, places = MACHINES[machine](rng)
-    told, new = (places(rng.uniform(size=(count, 3))) for count in (rows, NEW_PLACES))
+    commanded, new = (places(rng.uniform(size=(count, 3))) for count in (rows, NEW_PLACES))
     device = transform((0.1, 0.2, -0.3), (1.0, 2.0, 0.3))
-    seen = (told + error(told)) @ device[:3, :3].T + device[:3, 3] + PLACE_NOISE_M * rng.normal(size=(rows, 3))
-    robot = dc.cartesian(told)
-    data = dc.Measurements(dc.pose_inputs(robot, told), torch.from_numpy(seen), doubt=False)
+    seen = (
+        (commanded + error(commanded)) @ device[:3, :3].T + device[:3, 3] + PLACE_NOISE_M * rng.normal(size=(rows, 3))
+    )
+    robot = dc.cartesian(commanded)
+    data = dc.Measurements(dc.pose_inputs(robot, commanded), torch.from_numpy(seen), doubt=False)
     model = dc.calibrate(robot, data).model
     true: Tensor = torch.from_numpy((new + error(new)) @ device[:3, :3].T + device[:3, 3])
     mean, covariance = model.predict(dc.pose_inputs(robot, new), noise=False)

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
-from told_bank import BOARD, CAMERA, bent, drawn, flange, seen, turned, write_columns
+from commanded_bank import BOARD, CAMERA, bent, drawn, flange, seen, turned, write_columns
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli import told_poses
+from diffeo_calib.cli import commanded_poses
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
@@ -33,12 +33,12 @@ def cells(path: Path) -> list[list[str]]:
 
 
 def hand_eye_table(path: Path, convention: str, angle: str, *, camera_on_tool: bool) -> Path:
-    told = flange()
-    found = seen(told, camera_on_tool=camera_on_tool)
-    turns = rotation_numbers(told[:, :3, :3], convention, angle=angle)
+    commanded = flange()
+    found = seen(commanded, camera_on_tool=camera_on_tool)
+    turns = rotation_numbers(commanded[:, :3, :3], convention, angle=angle)
     quaternions = rotation_numbers(found[:, :3, :3], "quat_wxyz")
     own = "_".join(("RX", "RY", "RZ") if turns.shape[1] == 3 else ("q0", "q1", "q2", "q3"))
-    poses = {"X_Y_Z": 1e3 * told[:, :3, 3], own: turns}
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], own: turns}
     return write_columns(path, **poses, tx_ty_tz=1e3 * found[:, :3, 3], qw_qx_qy_qz=quaternions)
 
 
@@ -79,8 +79,8 @@ def test_whose_columns_are_the_machine_s(names: str, machine: str, tmp_path: Pat
     pose = transforms(turned(drawn(4, 3, seed=2)), drawn(4, 3, seed=3)).mT.flatten(1)  # by columns
     values = torch.cat([pose if "O_T_EE" in names else drawn(4, 0, seed=1), drawn(4, 30, seed=1)], 1)
     table = write_columns(tmp_path / "t.csv", **{"|".join(names.split()): values[:, : len(names.split())]})
-    found = told_poses.bodies_in(table, guess_sheet(table))
-    assert told_poses.machine_of(found).place[0] == machine
+    found = commanded_poses.bodies_in(table, guess_sheet(table))
+    assert commanded_poses.machine_of(found).place[0] == machine
 
 
 def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, command: Command) -> None:
@@ -130,15 +130,15 @@ def without_frames(there: Tensor, wanted: Tensor) -> float:
 
 @pytest.mark.slow
 def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command) -> None:
-    told = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    measured = bent(told) + 2e-5 * drawn(80, 3, seed=2)
-    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * told, "x_y_z": 1e3 * measured})
+    commanded = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    measured = bent(commanded) + 2e-5 * drawn(80, 3, seed=2)
+    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * commanded, "x_y_z": 1e3 * measured})
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
     done = command("fit", tmp_path / "c.toml")
     assert done.code == 0, done.error
-    told_alone = write_columns(tmp_path / "told.csv", x_y_z=1e3 * told[:5])
-    done = command("predict", tmp_path / "t.safetensors", told_alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
+    alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
+    done = command("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
     assert done.code == 0, done.error
     assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     done = command(
@@ -180,18 +180,18 @@ def test_neither_a_robot_nor_poses(tmp_path: Path, command: Command) -> None:
 
 def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, command: Command) -> None:
     """Within 5 mm, or 5 m: the user says which."""
-    told = 5.0 * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=told, x_y_z=bent(told))
+    commanded = 5.0 * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=commanded, x_y_z=bent(commanded))
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     text = (tmp_path / "c.toml").read_text(encoding="utf-8")
     assert '# length = "m"' in text
     assert '# length = "mm"' in text
 
 
-def test_two_markers_of_a_machine_that_is_told_places(tmp_path: Path, command: Command) -> None:
-    told = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    markers = {"left_x|left_y|left_z": bent(told), "right_x|right_y|right_z": bent(told) + 0.1}
-    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": told, **markers})
+def test_two_markers_of_a_machine_with_commanded_places(tmp_path: Path, command: Command) -> None:
+    commanded = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    markers = {"left_x|left_y|left_z": bent(commanded), "right_x|right_y|right_z": bent(commanded) + 0.1}
+    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": commanded, **markers})
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     found = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
     assert found["position"] == ["left_x,left_y,left_z", "right_x,right_y,right_z"]
@@ -227,12 +227,12 @@ def test_a_quaternion_that_is_none(tmp_path: Path, command: Command) -> None:
 
 def test_conventions_that_the_rows_do_not_tell_apart(tmp_path: Path, command: Command) -> None:
     """Turns about z, small ones about x: the order of the angles does not matter."""
-    told = flange()
-    axes = torch.stack([0 * told[:, 0, 3], 0 * told[:, 0, 3], drawn(len(told), seed=4)], 1)
-    told[:, :3, :3] = turned(axes) @ turned(1e-4 * drawn(len(told), 3, seed=5))
-    found = seen(told, camera_on_tool=True)
-    turns = rotation_numbers(told[:, :3, :3], "xyz", angle="deg"), rotation_numbers(found[:, :3, :3], "quat_xyzw")
-    poses = {"X_Y_Z": 1e3 * told[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": 1e3 * found[:, :3, 3]}
+    commanded = flange()
+    axes = torch.stack([0 * commanded[:, 0, 3], 0 * commanded[:, 0, 3], drawn(len(commanded), seed=4)], 1)
+    commanded[:, :3, :3] = turned(axes) @ turned(1e-4 * drawn(len(commanded), 3, seed=5))
+    found = seen(commanded, camera_on_tool=True)
+    turns = rotation_numbers(commanded[:, :3, :3], "xyz", angle="deg"), rotation_numbers(found[:, :3, :3], "quat_xyzw")
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": 1e3 * found[:, :3, 3]}
     table = write_columns(tmp_path / "t.csv", **poses, qx_qy_qz_qw=turns[1])
     done = command("init", table, "-o", tmp_path / "c.toml")
     assert done.code == 0, done.error

@@ -1,4 +1,4 @@
-"""Machines that are told poses or places, and what was measured of them."""
+"""Machines with commanded poses or places, and what was measured of them."""
 
 from __future__ import annotations
 
@@ -36,10 +36,12 @@ CAMERA = transforms(turned(torch.tensor([[0.1, -0.05, 0.8]])), torch.tensor([[0.
 BOARD = transforms(turned(torch.tensor([[0.02, 0.01, 0.3]])), torch.tensor([[0.5, 0.02, 0.01]]))[0]
 
 
-def seen(told: Tensor, *, camera_on_tool: bool, seed: int = 9) -> Tensor:
+def seen(commanded: Tensor, *, camera_on_tool: bool, seed: int = 9) -> Tensor:
     """(N, 4, 4) what a camera measures, m: the board of a camera on the tool, or the tool of a fixed one."""
-    exact = torch.linalg.inv(told @ CAMERA) @ BOARD if camera_on_tool else torch.linalg.inv(BOARD) @ told @ CAMERA
-    noise = drawn(len(told), 6, seed=seed)
+    exact = (
+        torch.linalg.inv(commanded @ CAMERA) @ BOARD if camera_on_tool else torch.linalg.inv(BOARD) @ commanded @ CAMERA
+    )
+    noise = drawn(len(commanded), 6, seed=seed)
     return transforms(turned(3e-4 * noise[:, 3:]) @ exact[:, :3, :3], exact[:, :3, 3] + 1e-4 * noise[:, :3])
 
 

@@ -124,7 +124,9 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     """
     bodies = bodies_in(csv, sheet)
     if not bodies:
-        expected = "a ROBOT whose joints the table has columns of, or columns of the poses that a machine was told"
+        expected = (
+            "a ROBOT whose joints the table has columns of, or columns of the poses that a machine was commanded to"
+        )
         raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
@@ -151,7 +153,7 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     alike, worse = [one for left, one in found if left < limit], [left for left, _ in found if left >= limit]
     why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
     why += f", read in any other way {100 * min(worse):.3g} %" if worse else ""
-    first = f"{why}; by their names, poses that the machine was told, in place of joint values"
+    first = f"{why}; by their names, commanded poses in place of joint values"
     columns = [*_every("robot-pose", [one.joints.text for one in alike], first)]
     return alike[0], columns, [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
 
@@ -183,18 +185,18 @@ def _read(
 ) -> Iterator[tuple[float, Source]]:
     """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
     turn, seen_at = ([], None) if body is None else (body.turn, _numbers(csv, sheet, body.place))
-    told_at = _numbers(csv, sheet, machine.place)
-    length = _lengths(machine.place, told_at)[0]
+    commanded_at = _numbers(csv, sheet, machine.place)
+    length = _lengths(machine.place, commanded_at)[0]
     other = length if body is None or seen_at is None else _lengths(body.place, seen_at)[0]
     own, seen = (_readings(_numbers(csv, sheet, names)) for names in (machine.turn, turn))
-    if own and seen and told_at is not None and seen_at is not None:
-        metres = [values / UNITS_PER_METRE[unit] for values, unit in ((told_at, length), (seen_at, other))]
+    if own and seen and commanded_at is not None and seen_at is not None:
+        metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
     else:
         ways = list(product(own or [Reading()], seen or [Reading()], (False, True) if rows.of_boards else (False,)))
-    for told, measured, camera in ways:
-        pose = PoseColumns((*machine.place, *machine.turn), told.convention)
-        table = TableFormat(other, told.angle, sheet.sep, sheet.decimal)
+    for commanded, measured, camera in ways:
+        pose = PoseColumns((*machine.place, *machine.turn), commanded.convention)
+        table = TableFormat(other, commanded.angle, sheet.sep, sheet.decimal)
         table = replace(table, joint_length=None if length == other else length, camera_on_tool=camera)
         if turn:
             unit = measured.angle if len(turn) == 3 else None
@@ -237,7 +239,7 @@ def _readings(numbers: Tensor | None) -> dict[Reading, Tensor]:
 
 
 def _alike(
-    told: tuple[Tensor, dict[Reading, Tensor]], seen: tuple[Tensor, dict[Reading, Tensor]]
+    commanded: tuple[Tensor, dict[Reading, Tensor]], seen: tuple[Tensor, dict[Reading, Tensor]]
 ) -> list[tuple[Reading, Reading, bool]]:
     """Ways to read the rotations of both bodies, and whether what stands was seen from the flange, the likeliest first.
 
@@ -246,11 +248,11 @@ def _alike(
     structure-from-motion", 2001), and what is left.
 
     Args:
-        told: places (N, 3), m, of the machine, and its rotations (N, 3, 3) by reading. seen: the same of the other.
+        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. seen: of the other body.
     """
-    some = slice(None, None, -(-len(told[0]) // MOST_ROWS))
+    some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     found = list[tuple[float, tuple[Reading, Reading, bool]]]()
-    R, t = _motions(told[0][some], torch.stack([*told[1].values()])[:, some])
+    R, t = _motions(commanded[0][some], torch.stack([*commanded[1].values()])[:, some])
     for camera in (False, True):
         turns, places = torch.stack([*seen[1].values()])[:, some], seen[0][some]
         shifts = -(turns.mT @ places[:, :, None])[..., 0] if camera else places
@@ -262,7 +264,7 @@ def _alike(
         shift = torch.einsum("aij,abj->abi", torch.linalg.pinv(G.flatten(1, 2)), right.flatten(2))
         moved = (torch.einsum("akij,abj->abki", G, shift) - right).square().sum(3).mean(2)
         left = turned.square().sum((3, 4)).mean(2).sqrt() + (moved / t.square().sum(2).mean(1)[:, None]).sqrt()
-        each = product(told[1], seen[1])
+        each = product(commanded[1], seen[1])
         found += [(float(size), (*pair, camera)) for size, pair in zip(left.flatten(), each, strict=True)]
     found.sort(key=lambda entry: entry[0])
     return [way for size, way in found if size <= ALIKE * found[0][0]][:MOST_WAYS]

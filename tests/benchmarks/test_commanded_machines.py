@@ -1,0 +1,30 @@
+"""The benchmark of machines with commanded poses or places: its machines, and that they are calibrated."""
+
+from __future__ import annotations
+
+import commanded_machines
+import numpy as np
+import pytest
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")]
+
+
+def test_least_squares_find_what_has_no_noise() -> None:
+    commanded = commanded_machines.flange_poses(np.random.default_rng(0), 12)
+    seen = np.linalg.inv(commanded @ commanded_machines.CAMERA) @ commanded_machines.BOARD
+    camera, board = commanded_machines.squares(commanded, seen)
+    np.testing.assert_allclose(camera, commanded_machines.CAMERA, atol=1e-9)
+    np.testing.assert_allclose(board, commanded_machines.BOARD, atol=1e-9)
+
+
+@pytest.mark.parametrize("machine", commanded_machines.MACHINES)
+def test_an_error_field_is_found(machine: str) -> None:
+    found = commanded_machines.field(machine, 120, 0)
+    assert float(found["after_mm"] or 0.0) < 0.4 * float(found["before_mm"] or 0.0)
+    assert float(found["inside"] or 0.0) > 0.85
+
+
+def test_a_perfect_arm() -> None:
+    found = commanded_machines.hand_eye(20, 0.0, 0)
+    assert float(found["camera_mm"] or 0.0) < 0.3
+    assert float(found["sigmas"] or 0.0) < 4.0
