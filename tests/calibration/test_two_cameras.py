@@ -111,7 +111,7 @@ def test_both_cameras_are_where_they_are_whoever_holds_the_frame() -> None:
 
 def test_the_files_of_each_camera_begin_with_its_name(tmp_path: Path) -> None:
     files = camera_files(kind().model)
-    assert Counter(name.partition("_")[0] for name in files) == {"left": 5, "right": 5}
+    assert Counter(name.partition("_")[0] for name in files) == {"left": 6, "right": 6}
     for name in ("left", "right"):
         (tmp_path / name).write_text(files[f"{name}_camera.yaml"])
         assert f'child link="{name}_optical_frame"' in files[f"{name}_camera.xacro"]
@@ -162,7 +162,7 @@ def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> 
     again: Any = dc.recalibrate(on_tool().model, rows).model
     check_hand_eyes(again, 1.5e-4)
     dc.save(again, tmp_path / "again.safetensors")
-    assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 10  # pyright: ignore
+    assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
     alone = rows.rows([name == "right" for name in rows.camera_names])
     check_hand_eyes(dc.recalibrate(on_tool().model, alone).model, 1e-4)
 
