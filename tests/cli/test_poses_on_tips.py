@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,7 +127,7 @@ def test_evaluation_with_one_hand_hidden_is_that_of_the_other(case: Case) -> Non
 def test_predictions_are_read_back_without_errors(case: Case, command: Command, tmp_path: Path) -> None:
     done = command("predict", case.path, case.folder / "new.csv", *UNITS, "-o", tmp_path / "p.csv")
     assert (done.code, done.err.strip()) == (0, "")
-    options = " ".join(done.out.split()).split("read these poses with ")[1].split()
+    options = shlex.split(" ".join(done.out.split()).split("read these poses with ")[1])
     again = command("evaluate", case.path, tmp_path / "p.csv", *UNITS, *options)
     assert again.code == 0
     row = next(line for line in again.out.splitlines() if "60 in all" in line)
