@@ -5,14 +5,15 @@
 `hand-eye`: a camera on the flange sees a board (0.1 mm and 0.3 mrad of noise); the arm is off by a smooth random field
 over its poses of 0, 0.3 or 1 mm (and twice as many mrad). Peers that take the arm to be perfect: least squares over
 camera and board (SciPy), weighted by the true noise, and, where OpenCV 4 is installed, the five methods of
-`calibrateHandEye`. Errors are those of the camera in the flange, and of the camera's place at 200 other poses.
+`calibrateHandEye`. Errors are those of the camera in the flange, and of the camera's place at 200 other poses. No
+linear unbiased estimate is better on average than `bound_mm`, not even one that knows the covariance of the field.
 `gantry`, `delta`, `small`: a machine of 1 m out of square and bent; a delta robot with wrong lengths and zeros; smooth
 random errors within 0.2 m. Measured places have 0.05 mm of noise a coordinate; errors are those of 500 other places.
 
 Fields of a record: `machine`, `rows`, `arm_mm`, `seed`; `before_mm` of the machine as it is, `after_mm` of the model at
 new places, `inside` share of these in 95 % regions; `camera_mm` of the hand-eye transform, `sigmas` the largest of its
 errors in standard deviations, `inside_camera` share of its six numbers within 1.96; `peer_mm`, `peer_after_mm` of least
-squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4.
+squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4; `bound_mm`.
 """
 
 from __future__ import annotations
@@ -42,9 +43,11 @@ import diffeo_calib as dc
 from diffeo_calib.kinematics.hand_eye import HandEye
 
 COLUMNS = ("machine", "rows", "arm_mm", "seed", "before_mm", "after_mm", "inside", "camera_mm", "sigmas")
-COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm")
+COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm", "bound_mm")
 SHIFT_NOISE_M, TURN_NOISE_RAD, PLACE_NOISE_M = 1e-4, 3e-4, 5e-5
 NEW_POSES, NEW_PLACES = 200, 500
+WAVES_PER_UNIT, TURN_PER_SHIFT = 2.0, 2.0
+"""Of the arm's field: its rates, and rad of turn for m of shift."""
 Poses = NDArray[np.float64]
 """(N, 4, 4), m; or places (N, 3), m."""
 ErrorOf = Callable[[Poses], Poses]
@@ -83,14 +86,10 @@ def flange_poses(rng: np.random.Generator, count: int) -> Poses:
 def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
     """One camera on the flange of one arm."""
     rng = np.random.default_rng(seed)
-    field = waves(rng, 6, 6, 2.0)
+    field = waves(rng, 6, 6, WAVES_PER_UNIT)
 
     def true(poses: Poses) -> Poses:
-        error = 1e-3 * arm_mm * field(np.concatenate([poses[:, :3, 3], (DOWN.inv() * turns_of(poses)).as_rotvec()], 1))
-        found = transform(2.0 * error[:, 3:])
-        found[:, :3, :3] = found[:, :3, :3] @ poses[:, :3, :3]
-        found[:, :3, 3] = poses[:, :3, 3] + error[:, :3]
-        return found
+        return moved(poses, 1e-3 * arm_mm * field(inputs_of(poses)))
 
     commanded, new = flange_poses(rng, rows), flange_poses(rng, NEW_POSES)
     exact = np.linalg.inv(true(commanded) @ CAMERA) @ BOARD
@@ -118,7 +117,21 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
         "peer_mm": 1e3 * float(np.linalg.norm(peer[:3, 3] - CAMERA[:3, 3])),
         "peer_after_mm": 1e3 * rms(nominal),
         "opencv_mm": best_of_opencv(commanded, seen),
+        "bound_mm": bound_mm(commanded, 1e-3 * arm_mm),
     }
+
+
+def inputs_of(poses: Poses) -> Poses:
+    """(N, 6) of the arm's field, m and rad."""
+    return np.concatenate([poses[:, :3, 3], (DOWN.inv() * turns_of(poses)).as_rotvec()], 1)
+
+
+def moved(poses: Poses, error: Poses) -> Poses:
+    """Poses with the errors (N, 6) of an arm."""
+    found = transform(TURN_PER_SHIFT * error[:, 3:])
+    found[:, :3, :3] = found[:, :3, :3] @ poses[:, :3, :3]
+    found[:, :3, 3] = poses[:, :3, 3] + error[:, :3]
+    return found
 
 
 def turns_of(poses: Poses) -> Rotation:
@@ -134,14 +147,33 @@ def turn_between(first: Poses, second: Poses) -> Poses:
 def squares(commanded: Poses, seen: Poses) -> tuple[Poses, Poses]:
     """Camera in the flange and board in the base by least squares from the truth, which is the peer's best case."""
 
-    def left(x: Poses) -> Poses:
-        camera, board = CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
-        expected = np.linalg.inv(commanded @ camera) @ board
-        shift = (expected - seen)[:, :3, 3] / SHIFT_NOISE_M
-        return np.concatenate([shift, turn_between(expected, seen) / TURN_NOISE_RAD]).ravel()
-
-    x = least_squares(left, np.zeros(12), x_scale="jac").x
+    x = least_squares(lambda x: left(x, commanded, seen).ravel(), np.zeros(12), x_scale="jac").x
     return CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
+
+
+def left(x: Poses, flange: Poses, seen: Poses) -> Poses:
+    """(N, 6) errors of board poses in standard deviations, with turn and shift x (12,) of camera and board."""
+    camera, board = CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:])
+    expected = np.linalg.inv(flange @ camera) @ board
+    shift = (expected - seen)[:, :3, 3] / SHIFT_NOISE_M
+    return np.concatenate([shift, turn_between(expected, seen) / TURN_NOISE_RAD], 1)
+
+
+def bound_mm(flange: Poses, arm_m: float) -> float:
+    """RMS error of the camera's place by the best linear unbiased estimate, which knows the covariance of the field.
+
+    Six waves of random rates have the covariance exp(-rate^2 d^2 / 2) in each output (Gauss and Markov's theorem).
+    """
+    nothing, seen, h = np.zeros(12), np.linalg.inv(flange @ CAMERA) @ BOARD, 1e-6
+    by_unknown = np.stack([left(h * one, flange, seen).ravel() / h for one in np.eye(12)], 1)
+    errors = [moved(flange, np.tile(h * one, (len(flange), 1))) for one in np.eye(6)]
+    by_error = np.stack([left(nothing, own, seen) / h for own in errors], 2)  # (N, 6, 6)
+    x = inputs_of(flange)
+    K = arm_m**2 * np.exp(-0.5 * WAVES_PER_UNIT**2 * ((x[:, None] - x) ** 2).sum(2))
+    covariance = np.einsum("iab,ij,jcb->iajc", by_error, K, by_error).reshape(len(by_unknown), -1)
+    covariance += np.eye(len(covariance))
+    found = np.linalg.inv(by_unknown.T @ np.linalg.solve(covariance, by_unknown))
+    return 1e3 * float(np.sqrt(found.diagonal()[3:6].sum()))
 
 
 def best_of_opencv(commanded: Poses, seen: Poses) -> float | None:

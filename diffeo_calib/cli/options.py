@@ -91,7 +91,7 @@ class Units:
     robot_pose: str | None = option(
         "Columns of the commanded place or pose, as the controller writes it, in place of "
         "joint values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the "
-        "unit of --angle.",
+        "unit of --angle; or A,B,...=FILE.py:NAME, a function of yours that makes places or poses of these columns.",
         "X,Y,Z[,...]",
     )
     sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")

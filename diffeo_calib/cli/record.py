@@ -205,7 +205,10 @@ def check_outputs(
     for name, path in inputs.items():
         if name not in may_come and not os.path.lexists(path):
             kind = "model file" if name in ("MODEL", "OLD") else "file"
-            raise InputError.of(f"there is no {kind} {path}", fix=f"check the path of {name}")
+            fix = f"check the path of {name}"
+            if ".py:" in path.name:
+                fix = f"name a function with the columns that it reads: --robot-pose A,B,...={path}"
+            raise InputError.of(f"there is no {kind} {path}", fix=fix)
 
 
 def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:

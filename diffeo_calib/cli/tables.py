@@ -29,7 +29,7 @@ from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.pose_columns import PROGRAM, PoseColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -134,6 +134,10 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
+    program = completed[1].robot_pose
+    if units.robot_pose is None and program is not None and PROGRAM in program:
+        fix = f"type it again, a model file starts no program: --robot-pose {program}"
+        raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
@@ -322,7 +326,7 @@ def joints_of(units: Units) -> str | PoseColumns | None:
 def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | PoseColumns:
     """Names of the joint columns: those given, or the robot's; or the columns of the pose of a machine."""
     if isinstance(joints, PoseColumns):
-        count = len(joints.columns) if not joints.convention else POSE_JOINTS
+        count = robot.n if joints.is_program else len(joints.columns) if not joints.convention else POSE_JOINTS
         if not is_cartesian(robot) or robot.n != count:
             expected = f"the {robot.n} joint values of robot '{robot.name}'"
             raise InputError.of(f"--robot-pose {','.join(joints.columns)}", expected=expected, got="other inputs")
@@ -339,6 +343,11 @@ def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | 
         order = ", ".join(robot.joint_names)
         raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
     return names
+
+
+def written_columns(names: list[str] | PoseColumns) -> list[str] | PoseColumns:
+    """Columns in which joint values are written that were read from these."""
+    return names.written if isinstance(names, PoseColumns) else names
 
 
 def _position_triples(position: list[str]) -> list[list[str]]:

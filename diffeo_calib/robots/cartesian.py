@@ -23,8 +23,8 @@ from diffeo_calib.robots.tree import Chain, Tree
 
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
 """Names of the joints."""
-BEYOND = 0.25
-"""Limits lie beyond the poses by this share of their range."""
+BEYOND, LEAST_BEYOND_RAD = 0.25, 0.35
+"""Limits lie beyond the poses by this share of their range; of turns at least by so much."""
 FLAT, STEEPEST = 0.8, 0.97
 """Sine of the largest b about the mean of the poses, and about any middle."""
 DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
@@ -121,6 +121,7 @@ def _chain(inputs: Tensor, middle: Tensor | None = None) -> Chain:
     inputs, eye = inputs.detach().cpu(), torch.eye(4, dtype=torch.float64, device="cpu")
     low, high = inputs.amin(0), inputs.amax(0)
     beyond = BEYOND * (high - low)
+    beyond[3:] = beyond[3:].clamp(min=LEAST_BEYOND_RAD)
     ends = list(zip((low - beyond).tolist(), (high + beyond).tolist(), strict=True))
     slides = zip(SLIDES, eye[:3, :3], ends, strict=False)
     joints = [Joint(name, "prismatic", eye, axis, *limits) for name, axis, limits in slides]

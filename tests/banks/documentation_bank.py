@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,8 @@ import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat
+
+POSES = Path(__file__).parents[2] / "scripts/docs/pages/howto/poses.md"
 
 OFFSET = 5e-4
 """Of the second joint since the first calibration, rad."""
@@ -65,6 +68,18 @@ def write_commanded_tables(place: Path) -> None:
     write_columns(
         place / "machine.csv", cmdx_cmdy_cmdz=1e3 * places, x_y_z=1e3 * (bent(places) + 2e-5 * drawn(40, 3, seed=2))
     )
+    delta = runpy.run_path(str(write_delta(place)))["kinematics"]
+    q = 5.0 + 50.0 * torch.rand(40, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    seen_there = 1.001 * delta(q + torch.tensor([0.1, -0.05, 0.08])) + 0.03 * drawn(40, 3, seed=4)
+    write_columns(place / "delta.csv", q1_q2_q3=q, x_y_z=seen_there)
+    write_columns(place / "targets.csv", q1_q2_q3=q[:5])
+
+
+def write_delta(place: Path) -> Path:
+    """The delta robot of the page about commanded poses."""
+    path, text = place / "my_delta.py", POSES.read_text(encoding="utf-8")
+    path.write_text(text.partition("```python\n")[2].partition("```")[0], encoding="utf-8")
+    return path
 
 
 def commands(text: str) -> list[str]:

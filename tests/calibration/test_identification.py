@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from commanded_bank import flange
 from product_bank import ur10_measurements
 from torch import Tensor
 
@@ -211,3 +212,17 @@ def test_a_ur10(ur10_folder: Path) -> None:
     start = register(robot, train.q, train.points).geometry
     found = identify(start, train.q, train.points).geometry
     assert 1e3 * dc.evaluate(found.points, test).rms < 0.43
+
+
+@pytest.mark.parametrize("axes", [3, 6])
+def test_the_joints_of_commanded_poses_have_no_errors(axes: int) -> None:
+    """They are numbers, not links: what is found is where base and marker are."""
+    commanded = flange() if axes == 6 else flange()[:, :3, 3]
+    machine = dc.cartesian(commanded)
+    geometry = Geometry.nominal(machine).with_tool(torch.tensor([[0.1, 0.0, 0.05]], dtype=torch.float64))
+    q = dc.pose_inputs(machine, commanded)
+    found = identify(geometry, q, geometry.points(q) + draw(len(q), 1, 3, size=1e-3))
+    joints = geometry.slices["joints"]
+    assert float(found.theta[joints].abs().max()) == 0.0
+    assert float(found.deviations[joints].max()) == 0.0
+    assert float(found.deviations[geometry.slices["base"]].min()) > 1e-5

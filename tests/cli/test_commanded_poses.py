@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import BOARD, CAMERA, bent, drawn, flange, seen, turned, write_columns
+from commanded_bank import BOARD, CAMERA, DOWN, bent, drawn, flange, seen, turned, write_columns
+from documentation_bank import write_commanded_tables
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.cli import commanded_poses
 from diffeo_calib.cli.guesses import guess_sheet
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv import pose_columns
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -239,3 +246,119 @@ def test_conventions_that_the_rows_do_not_tell_apart(tmp_path: Path, command: Co
     text = (tmp_path / "c.toml").read_text(encoding="utf-8")
     assert '# robot-pose = "X,Y,Z,RX,RY,RZ=xyz"' in text
     assert '# robot-pose = "X,Y,Z,RX,RY,RZ=XYZ"' in text
+
+
+@pytest.fixture(scope="module")
+def delta(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a delta robot, its table and its program."""
+    place = tmp_path_factory.mktemp("delta")
+    write_commanded_tables(place)
+    return place
+
+
+MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
+
+
+def test_a_function_in_place_of_a_robot(
+    delta: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(delta)
+    pose, model = ["--robot-pose", "q1,q2,q3=my_delta.py:kinematics"], tmp_path / "m.safetensors"
+    done = command("fit", "delta.csv", *pose, *MEASURED, "--json", tmp_path / "f.json", "-o", model)
+    assert done.code == 0, done.error
+    done = command("evaluate", model, "delta.csv")
+    assert done.code == 1
+    assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=my_delta.py:kinematics" in done.error
+    done = command("predict", model, "delta.csv", *pose, "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.error
+    (header, *rows), (_, *measured) = cells(tmp_path / "p.csv"), cells(delta / "delta.csv")
+    assert header[:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
+    found = torch.tensor([[float(cell) for cell in row[:6]] for row in rows], dtype=torch.float64)
+    q, there = torch.tensor([[float(cell) for cell in row] for row in measured], dtype=torch.float64).split(3, 1)
+    nominal = runpy.run_path("my_delta.py")["kinematics"](q)
+    assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
+    assert float((found[:, 3:] - there).norm(dim=1).mean()) < 0.2 * without_frames(nominal, there)
+    assert command("plan", model, "-n", "3", *pose, "-o", tmp_path / "n.csv").code == 0
+    assert cells(tmp_path / "n.csv")[0] == ["x", "y", "z", "rank"]
+    done = command("correct", model, "targets.csv", *pose, "-o", tmp_path / "c.csv")
+    assert done.code == 0, done.error
+    header, *rows = cells(tmp_path / "c.csv")
+    assert {row[header.index("status")] for row in rows} == {"reached"}
+    corrected = [[float(row[header.index(axis)]) for axis in "xyz"] for row in rows]
+    again = write_columns(tmp_path / "again.csv", x_y_z=torch.tensor(corrected, dtype=torch.float64))
+    places = ["--robot-pose", "x,y,z", "--length", "mm", "--angle", "deg"]
+    assert command("predict", model, again, *places, "-o", tmp_path / "a.csv").code == 0
+    reached = [[float(cell) for cell in row[3:6]] for row in cells(tmp_path / "a.csv")[1:]]
+    wanted = nominal[:5] - nominal[:5].mean(0)
+    away = torch.tensor(reached, dtype=torch.float64)
+    assert without_frames(wanted, away) < 0.05  # of the frame of the device
+
+
+def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    pose_columns._module.cache_clear()
+    commanded = flange()
+    torch.save(commanded, tmp_path / "frames.pt")
+    text = "import torch\n\ndef kinematics(cells):\n    return torch.load('frames.pt')\n"
+    (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    own = PoseColumns.of("a,b=own.py:kinematics")
+    machine = cartesian(own.poses(drawn(len(commanded), 2, seed=0)))
+    told = replace(own, robot=machine)
+    assert_close(machine(told.values(drawn(len(commanded), 2, seed=0))), commanded, rtol=0, atol=1e-12)
+    assert told.written.columns == ("x", "y", "z", "rx", "ry", "rz")
+    assert_close(
+        told.written.poses(told.written.cells(told.values(drawn(24, 2, seed=0)))), commanded, rtol=0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "message"),
+    [
+        (None, "f", r"'own.py' cannot be read \(No such file or directory\)"),
+        ("1 +", "f", "'own.py' does not run: got SyntaxError"),
+        ("f = 1 / 0", "f", "'own.py' does not run: got ZeroDivisionError"),
+        ("f = None", "f", "the file 'own.py': expected a function f"),
+        ("def f(q): return q @ q", "f", "own.py:f of 5 rows: got RuntimeError"),
+        ("def f(q): return q[:, :1].expand(-1, 4)", "f", r"returns: expected places \(5, k\).* got \(5, 4\)"),
+        ("def f(q): return q[:4]", "f", r"returns: expected places \(5, k\).* got \(4, 2\)"),
+        ("def f(q): return q[0]", "f", r"returns: expected places \(5, k\).* got \(2,\)"),
+        ("def f(q): return (q - q[2:3]).log()", "f", "of row .*2.*: expected finite numbers"),
+    ],
+)
+def test_functions_that_are_none(
+    text: str | None, name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pose_columns._module.cache_clear()
+    if text is not None:
+        (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    with pytest.raises(MeasurementError, match=message):
+        PoseColumns.of(f"a,b=own.py:{name}").poses(drawn(5, 2, seed=0))
+
+
+def test_a_function_is_named_with_its_columns(tmp_path: Path, command: Command) -> None:
+    table = write_columns(tmp_path / "t.csv", q1_q2_q3=drawn(9, 3, seed=1), x_y_z=drawn(9, 3, seed=2))
+    done = command("fit", table, "--robot", "own.py:f", *MEASURED, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert "--robot-pose A,B,...=own.py:f" in done.error
+
+
+def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> None:
+    """The camera's place along the axis is open, which is said, and the next poses tilt."""
+    commanded = flange()
+    turn = torch.stack([*torch.zeros(2, len(commanded), dtype=torch.float64), drawn(len(commanded), seed=4)], 1)
+    commanded[:, :3, :3] = turned(turn) @ torch.tensor(DOWN, dtype=torch.float64)
+    found = seen(commanded, camera_on_tool=True)
+    turns = rotation_numbers(commanded[:, :3, :3], "rotvec"), rotation_numbers(found[:, :3, :3], "quat_xyzw")
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": 1e3 * found[:, :3, 3]}
+    table = write_columns(tmp_path / "t.csv", **poses, qx_qy_qz_qw=turns[1])
+    measured = ["--position", "tx,ty,tz", "--rotation", "qx,qy,qz,qw", "--convention", "quat_xyzw", "--camera-on-tool"]
+    pose = ["--robot-pose", "X,Y,Z,RX,RY,RZ=rotvec", "--length", "mm", "--angle", "rad"]
+    done = command("fit", table, *pose, *measured, "-o", tmp_path / "m")
+    assert done.code in (0, 2), done.error
+    assert re.search(r"is known to \d+ mm only: turn the tool about several axes", done.err)
+    assert command("plan", tmp_path / "m", "-n", "4", "-o", tmp_path / "n.csv").code == 0
+    _, *rows = cells(tmp_path / "n.csv")
+    new = torch.tensor([[float(cell) for cell in row[3:6]] for row in rows], dtype=torch.float64)
+    z = turned(new)[:, :, 2]
+    assert float((z @ z.mT).min()) < 0.97

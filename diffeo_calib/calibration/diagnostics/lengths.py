@@ -118,7 +118,7 @@ def _lengths_of(data: TangentData) -> Iterator[Hypothesis]:
         return motion if data.slopes is None else data.slopes @ motion
 
     yield Hypothesis("the size of the robot", seen(away), PERCENT, OF_ROBOT)
-    if not data.held:  # a device has axes
+    if not data.adrift:  # a device has axes
         eye = torch.eye(3, dtype=away.dtype, device=away.device)
         for axis, own in zip("xyz", eye, strict=True):
             yield Hypothesis(f"the scale of the measuring frame along {axis}", seen(away * own), PERCENT, OF_AXIS)

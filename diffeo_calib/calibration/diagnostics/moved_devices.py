@@ -245,12 +245,12 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
     kinds = data.noise_model.row_kinds
     if kinds is not None:
         base[kinds > 0] = 0.0  # a ball in a socket does not show where the device of other rows stands
-    frames = [] if data.held else [base, base[..., :3]]
+    frames = [] if data.adrift else [base, base[..., :3]]
     found = [Hypothesis(BASE, each, fix=NEW_SET_UP) for each in frames]
     found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
     found.append(Hypothesis(SCALE, away, ("ppm", 1e-6), NEW_SET_UP))
     for joint, name in enumerate(geometry.chain.joint_names):
-        if joint > 0 or not data.held:  # without a device no row shows an offset of the first joint
+        if joint > 0 or not data.adrift:  # without a device no row shows an offset of the first joint
             unit = "mrad" if data.space.periodic[joint] else "mm"
             found.append(Hypothesis(name, data.jacobian[..., joint, None], (unit, 1e-3), TWO_ROBOTS))
     found += [one._replace(effects=one.effects[index]) for one in devices]

@@ -22,6 +22,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
@@ -129,10 +130,15 @@ class Identification:
         return replace(self, geometry=whole, covariance=covariance, theta=theta, status=status)
 
 
-def held_parameters(geometry: Geometry) -> tuple[int, ...]:
-    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
-    base, joints = geometry.slices["base"], geometry.slices["joints"]
-    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
+def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
+    """Numbers of the parameters that stay zero.
+
+    Errors between the joints of a commanded pose, which are numbers and no links; and, ``adrift`` without a measuring
+    device, where the robot stands and its first joint, which no row tells apart.
+    """
+    base, joints = (range(geometry.size)[geometry.slices[name]] for name in ("base", "joints"))
+    of_numbers = joints if is_cartesian(geometry.chain) else range(0)
+    return tuple(sorted({*of_numbers, *base, *joints[:6]} if adrift else of_numbers))
 
 
 def identify(
@@ -143,7 +149,7 @@ def identify(
     prior: Prior | None = None,
     *,
     shared: Tensor | None = None,
-    held: Sequence[int] = (),
+    held: Sequence[int] | None = None,
 ) -> Identification:
     """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
 
@@ -158,12 +164,13 @@ def identify(
         noise: standard deviation of one coordinate [m].
         prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
         shared: (N, P, 3, c) effects Z of shifts of unit variance that rows share [m].
-        held: numbers of parameters that stay zero.
+        held: numbers of parameters that stay zero; see :func:`held_parameters`, by default those with a device.
 
     Note:
         Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
     q, points = q.detach().cpu(), points.detach().cpu()
+    held = held_parameters(geometry) if held is None else held
     own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
     rows = Rows(geometry, (own,))
     if noise is not None:

@@ -236,8 +236,8 @@ class Placed:
         nominal = GeometryMap(geometry, elastic=True, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
-        held = held_parameters(geometry) if self.free else ()
-        return replace(data, shared=self.placement.shared(data), held=held)
+        held = held_parameters(geometry, adrift=self.free)
+        return replace(data, shared=self.placement.shared(data), held=held, adrift=self.free)
 
     def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
         """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
@@ -283,7 +283,7 @@ class Placed:
         found = replace(self.identification, tails=tails)
         own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
-        rows = replace(rows, held=like.held)
+        rows = replace(rows, held=like.held, adrift=like.adrift)
         return own, replace(rows, shared=placement.shared(rows))
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:

@@ -166,7 +166,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    held, joints = held_parameters(bare), range(bare.size)[bare.slices["joints"]]
+    held, joints = held_parameters(bare, adrift=True), range(bare.size)[bare.slices["joints"]]
     root, still = Prior().root(bare, held), Prior().root(bare, [*held, *joints])
     poses = [bare.marker_poses(data.q) for data in tables]
     for data, T in zip(tables, poses, strict=True):
@@ -247,7 +247,7 @@ def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> Foun
         return None
     each, geometry = zip(tables, found.registered, freed, strict=True), found.registration.geometry
     parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
-    root = Prior().root(geometry, held_parameters(geometry))
+    root = Prior().root(geometry, held_parameters(geometry, adrift=True))
     return _estimate(Rows(geometry, parts), root, found.registration)
 
 

@@ -402,7 +402,7 @@ def geometry_by_sockets(
         data: rows with sockets. positions: (S, 3) of the registration [m].
     """
     geometry, resting = registration.geometry, data.socket_rows()
-    held = held_parameters(geometry) if data.without_device else ()
+    held = held_parameters(geometry, adrift=data.without_device)
     places = SocketDevices.around(data, positions)
     for _ in range(ROUNDS):
         placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))

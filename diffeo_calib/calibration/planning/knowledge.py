@@ -251,7 +251,7 @@ def of_robot(
     data = _tangent_data(geometry, lever, q, residual)
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
-    data = replace(data, held=held_parameters(geometry) if adrift else ())
+    data = replace(data, held=held_parameters(geometry, adrift=adrift), adrift=adrift)
     values = (data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T
     known, noise = Known(data.linearisation(scales), values, torch.ones_like(values[:, 0])), data.noise(scales)
     scene = Scene(data.points, noise, geometry.base, Bodies(lever).averaging(noise), 3 * len(tool.points), free=adrift)

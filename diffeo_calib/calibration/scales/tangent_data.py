@@ -54,6 +54,7 @@ class TangentData:
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
         held: numbers of the parameters theta that stay zero.
+        adrift: whether no device says where the robot stands.
         observe: what was measured of the markers; their coordinates by default.
         beside: the rows among these that tell coordinates, by themselves; None where all or none do.
     """
@@ -67,6 +68,7 @@ class TangentData:
     place_deviation: float = PLACES.found_m_rad
     shared: Tensor | None = None
     held: tuple[int, ...] = ()
+    adrift: bool = False
     observe: Observation | None = None
     beside: TangentData | None = None
 
@@ -88,7 +90,7 @@ class TangentData:
         negative residuals, which would look like another size.
         """
         kinds = self.noise_model.row_kinds
-        if self.observe is not None or (kinds is None and not self.held):
+        if self.observe is not None or (kinds is None and not self.adrift):
             return self.points
         resting = self.visible if kinds is None else self.visible & (kinds > 0)[:, None]
         return torch.where(resting, self.y, self.points)

@@ -13,7 +13,7 @@ from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format
+from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format, written_columns
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -21,9 +21,11 @@ from diffeo_calib.kinematics.compensation.compensate import Compensation, compen
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.writing import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
 AXES_OF_A_POSE = 6
@@ -84,8 +86,12 @@ def run(options: CorrectOptions) -> None:
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
     robot, tools = kinematics.robot, _tools(kinematics, options, table)
-    columns = Columns.of(table.joints_only(joint_columns(source.joints, robot), robot.kinds))
+    names = joint_columns(source.joints, robot)
+    columns = Columns.of(table.joints_only(names, robot.kinds))
     sheet = Program.read(program, table, columns.names)
+    if isinstance(names, PoseColumns) and names.is_program:
+        columns = Columns.of(table.joints_only(written_columns(names), robot.kinds))
+        sheet.check_free(columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4
     sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
@@ -95,6 +101,8 @@ def run(options: CorrectOptions) -> None:
     warn_outside_range(kinematics, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
+        if is_cartesian(robot) and robot.n < AXES_OF_A_POSE:  # commanded places
+            targets = targets[..., :3, 3]
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
     how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}

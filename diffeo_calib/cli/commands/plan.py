@@ -20,7 +20,7 @@ from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, plan
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, table_format
+from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, written_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -88,7 +88,7 @@ def run(given: PlanOptions) -> None:
             free=given.free,
             sensor=sensors,
         )
-    found.write(output, table, names)
+    found.write(output, table, written_columns(names))
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))

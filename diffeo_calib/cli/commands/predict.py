@@ -15,7 +15,7 @@ from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows
+from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows, written_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -53,7 +53,8 @@ def run(given: PredictOptions) -> None:
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:
         check_payload_column(kinematics, table.payload)
-    prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(names, robot.kinds)
+    written = written_columns(names)
+    prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(written, robot.kinds)
     if {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"} & {
         *Columns.of(columns).names
     }:  # commanded places have these names
@@ -73,7 +74,7 @@ def run(given: PredictOptions) -> None:
 
     with progress_bar() as progress:
         how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
-        write_predictions(output, blocks(), table, joints=names, **how)
+        write_predictions(output, blocks(), table, joints=written, **how)
     record.add(rows=len(q), files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_written
+from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_written, few
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.poses import (
@@ -26,14 +30,19 @@ from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain
 
+PROGRAM = ".py:"
+"""In the place of a convention: FILE.py:NAME, a function of the columns."""
+
 
 @dataclass(frozen=True, eq=False)
 class PoseColumns:
     """The columns of places, or of poses, and the joints of a machine that they tell; see :class:`JointExpressions`.
 
     Args:
-        columns: x, y, z, and the numbers of a rotation; or one to three coordinates of a place.
-        convention: how the rotation is written; empty for places.
+        columns: x, y, z, and the numbers of a rotation; or one to three coordinates of a place; or what a function
+            makes them of.
+        convention: how the rotation is written; empty for places. Or ``FILE.py:NAME``: a function of the cells (N, c)
+            as they stand in the table, a tensor, that returns places (N, k) or poses (N, 4, 4), in its unit of length.
         robot: the machine, see :func:`cartesian`; None before the poses are read.
         angle: unit of Euler angles and rotation vectors.
     """
@@ -45,7 +54,7 @@ class PoseColumns:
 
     @classmethod
     def of(cls, text: str) -> PoseColumns:
-        """Parse ``X,Y,Z``, or ``X,Y,Z,A,B,C=CONVENTION``.
+        """Parse ``X,Y,Z``, ``X,Y,Z,A,B,C=CONVENTION``, or ``A,B,C=FILE.py:NAME``.
 
         Raises:
             MeasurementError: another number of columns than the convention says, or a column twice.
@@ -56,7 +65,7 @@ class PoseColumns:
             what = f"the columns of a pose, {text}"
             raise MeasurementError.of(what, expected=f"=CONVENTION behind them: {CONVENTIONS}", got="none")
         with of_measurements():
-            count = 3 + numbers_of(convention.strip()) if equal else len(columns)
+            count = 3 + numbers_of(convention.strip()) if equal and PROGRAM not in convention else len(columns)
         if len(columns) != count or "" in columns or repeated(columns):
             expected = f"{count} names of columns" if equal else "names of columns"
             raise MeasurementError.of(f"the columns of a pose, {text}", expected=expected, got=as_written(columns))
@@ -66,6 +75,19 @@ class PoseColumns:
     def text(self) -> str:
         """What :meth:`of` parses."""
         return ",".join(self.columns) + f"={self.convention}" * bool(self.convention)
+
+    @property
+    def is_program(self) -> bool:
+        """Whether a function makes the poses of the columns."""
+        return PROGRAM in self.convention
+
+    @property
+    def written(self) -> PoseColumns:
+        """Columns in which poses of the machine are written: these, but of a function what it returns."""
+        if not self.is_program or self.robot is None:
+            return self
+        names = ("x", "y", "z", "rx", "ry", "rz")[: self.robot.n]
+        return replace(self, columns=names, convention="rotvec" if self.robot.n == 6 else "")
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -81,6 +103,8 @@ class PoseColumns:
         """Cells (N, c) -> poses (N, 4, 4), or places (N, c), in the unit of the table."""
         if not self.convention:
             return cells
+        if self.is_program:
+            return _made(self.convention, cells)
         with of_measurements():
             turns = rotation_matrices(
                 cells[:, 3:], self.convention, angle=self.angle, place="row {} of the commanded poses".format
@@ -93,7 +117,7 @@ class PoseColumns:
         Args:
             table: the columns of a file. per_metre: units of length in the file.
         """
-        if not self.convention:
+        if not self.convention or self.is_program:
             return
         cells = torch.stack([table[name] for name in self.columns], 1)
         cells[:, :3] /= per_metre
@@ -124,3 +148,43 @@ class PoseColumns:
         turns = rotation_numbers(poses[:, :3, :3], self.convention, angle=self.angle)
         found[known] = torch.cat([poses[:, :3, 3], turns], 1)
         return found
+
+
+def _made(program: str, cells: Tensor) -> Tensor:
+    """Poses (N, 4, 4) or places (N, k) that a function makes of cells (N, c).
+
+    Raises:
+        MeasurementError: a file that does not run, no such function, or one that fails or returns something else.
+    """
+    path, _, name = program.rpartition(":")
+    function: Callable[[Tensor], Any] | None = getattr(_module(path), name, None)
+    if function is None:
+        raise MeasurementError.of(f"the file '{path}'", expected=f"a function {name}", got="none of this name")
+    try:
+        found = torch.as_tensor(function(cells), dtype=cells.dtype)
+    except Exception as error:
+        raise MeasurementError.of(f"{program} of {len(cells)} rows", got=f"{type(error).__name__}: {error}") from error
+    places = found.ndim == 2 and 1 <= found.shape[1] <= 3
+    if len(found) != len(cells) or not (places or found.shape[1:] == (4, 4)):
+        expected = f"places ({len(cells)}, k) with k = 1, 2 or 3, or poses ({len(cells)}, 4, 4)"
+        raise MeasurementError.of(f"what {program} returns", expected=expected, got=str(tuple(found.shape)))
+    lost = (~found.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
+    if lost:
+        fix = "leave these rows out, or check the unit of their columns"
+        what = f"what {program} returns of row {few(lost)}"
+        raise MeasurementError.of(what, expected="finite numbers", got="NaN or infinity", fix=fix)
+    return found.to(cells.device)
+
+
+@cache
+def _module(path: str) -> ModuleType:
+    """A file of Python, run once."""
+    module = ModuleType(Path(path).stem)
+    try:
+        exec(compile(Path(path).read_bytes(), path, "exec"), vars(module))
+    except OSError as error:
+        fix = "check the path, relative to the current folder"
+        raise MeasurementError.of(f"'{path}' cannot be read ({error.strerror})", fix=fix) from error
+    except Exception as error:
+        raise MeasurementError.of(f"'{path}' does not run", got=f"{type(error).__name__}: {error}") from error
+    return module
