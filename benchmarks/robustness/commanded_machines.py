@@ -7,13 +7,16 @@ over its poses of 0, 0.3 or 1 mm (and twice as many mrad). Peers that take the a
 camera and board (SciPy), weighted by the true noise, and, where OpenCV 4 is installed, the five methods of
 `calibrateHandEye`. Errors are those of the camera in the flange, and of the camera's place at 200 other poses. No
 linear unbiased estimate is better on average than `bound_mm`, not even one that knows the covariance of the field.
+`corners`: the same arms and images of a board of 9 x 6 corners, 0.1 or 0.3 px of noise, the lens unknown. The peer is a
+bundle adjustment over camera, board and pinhole (SciPy); OpenCV's methods get poses by the true lens.
 `gantry`, `delta`, `small`: a machine of 1 m out of square and bent; a delta robot with wrong lengths and zeros; smooth
 random errors within 0.2 m. Measured places have 0.05 mm of noise a coordinate; errors are those of 500 other places.
 
-Fields of a record: `machine`, `rows`, `arm_mm`, `seed`; `before_mm` of the machine as it is, `after_mm` of the model at
-new places, `inside` share of these in 95 % regions; `camera_mm` of the hand-eye transform, `sigmas` the largest of its
-errors in standard deviations, `inside_camera` share of its six numbers within 1.96; `peer_mm`, `peer_after_mm` of least
-squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4; `bound_mm`.
+Fields of a record: `machine`, `rows`, `arm_mm`, `corner_px`, `seed`; `before_mm` of the machine as it is, `after_mm` of
+the model at new places, `inside` share of these in 95 % regions; `camera_mm` of the hand-eye transform, `sigmas` the
+largest of its errors in standard deviations, `inside_camera` share of its six numbers within 1.96; `peer_mm`,
+`peer_after_mm` of least squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4;
+`bound_mm`.
 """
 
 from __future__ import annotations
@@ -42,12 +45,15 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.kinematics.hand_eye import HandEye
 
-COLUMNS = ("machine", "rows", "arm_mm", "seed", "before_mm", "after_mm", "inside", "camera_mm", "sigmas")
+COLUMNS = ("machine", "rows", "arm_mm", "corner_px", "seed", "before_mm", "after_mm", "inside", "camera_mm", "sigmas")
 COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm", "bound_mm")
 SHIFT_NOISE_M, TURN_NOISE_RAD, PLACE_NOISE_M = 1e-4, 3e-4, 5e-5
 NEW_POSES, NEW_PLACES = 200, 500
 WAVES_PER_UNIT, TURN_PER_SHIFT = 2.0, 2.0
 """Of the arm's field: its rates, and rad of turn for m of shift."""
+PIXELS, FOCAL_PX, CORNERS, SQUARE_M = (1280, 1024), 800.0, (9, 6), 0.025
+LENS = np.array([FOCAL_PX, FOCAL_PX, (PIXELS[0] - 1) / 2.0, (PIXELS[1] - 1) / 2.0])
+"""The camera of images, and its board."""
 Poses = NDArray[np.float64]
 """(N, 4, 4), m; or places (N, 3), m."""
 ErrorOf = Callable[[Poses], Poses]
@@ -83,8 +89,8 @@ def flange_poses(rng: np.random.Generator, count: int) -> Poses:
     return found
 
 
-def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
-    """One camera on the flange of one arm."""
+def hand_eye(rows: int, arm_mm: float, seed: int, corner_px: float | None = None) -> Record:
+    """One camera on the flange of one arm, and poses of a board, or images of it."""
     rng = np.random.default_rng(seed)
     field = waves(rng, 6, 6, WAVES_PER_UNIT)
 
@@ -92,23 +98,28 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
         return moved(poses, 1e-3 * arm_mm * field(inputs_of(poses)))
 
     commanded, new = flange_poses(rng, rows), flange_poses(rng, NEW_POSES)
-    exact = np.linalg.inv(true(commanded) @ CAMERA) @ BOARD
-    seen = transform(TURN_NOISE_RAD * rng.normal(size=(rows, 3))) @ exact
-    seen[:, :3, 3] = exact[:, :3, 3] + SHIFT_NOISE_M * rng.normal(size=(rows, 3))
-    machine = dc.cartesian(commanded)
-    q, boards = dc.pose_inputs(machine, commanded), torch.from_numpy(seen)
-    model = dc.calibrate(machine, dc.Measurements.from_poses(q, boards, camera_on_tool=True, doubt=False)).model
+    exact, machine = np.linalg.inv(true(commanded) @ CAMERA) @ BOARD, dc.cartesian(commanded)
+    q = dc.pose_inputs(machine, commanded)
+    if corner_px is None:
+        seen = transform(TURN_NOISE_RAD * rng.normal(size=(rows, 3))) @ exact
+        seen[:, :3, 3] = exact[:, :3, 3] + SHIFT_NOISE_M * rng.normal(size=(rows, 3))
+        data = dc.Measurements.from_poses(q, torch.from_numpy(seen), camera_on_tool=True, doubt=False)
+        peer, board = squares(commanded, seen)
+    else:
+        corners = images(exact, corner_px, rng)
+        data = dc.Measurements.from_images(q, corners, PIXELS, doubt=False)
+        (peer, board), seen = bundle(commanded, corners), solved(corners)
+    model = dc.calibrate(machine, data).model
     camera = HandEye.of(model).camera
     away = np.concatenate([(camera.pose[:3, 3].numpy() - CAMERA[:3, 3]), turn_between(camera.pose.numpy(), CAMERA)])
     sigmas = np.abs(away) / camera.deviations.numpy()
     there = np.linalg.inv(BOARD) @ true(new) @ CAMERA  # the camera, seen from the board
     mean, covariance = model.predict_poses(dc.pose_inputs(machine, new), noise=False)
     shifts = torch.from_numpy(there[:, None, :3, 3]) - mean[:, None, :3, 3]
-    peer, board = squares(commanded, seen)
     nominal = (np.linalg.inv(board) @ new @ peer)[:, :3, 3] - there[:, :3, 3]
     return {
-        "machine": "hand-eye",
-        **{"rows": rows, "arm_mm": arm_mm, "seed": seed, "before_mm": None},
+        "machine": "hand-eye" if corner_px is None else "corners",
+        **{"rows": rows, "arm_mm": arm_mm, "corner_px": corner_px, "seed": seed, "before_mm": None},
         "after_mm": 1e3 * rms(shifts[:, 0].numpy()),
         "inside": covered(shifts, covariance[:, None, :3, :3]),
         "camera_mm": 1e3 * float(np.linalg.norm(away[:3])),
@@ -116,9 +127,52 @@ def hand_eye(rows: int, arm_mm: float, seed: int) -> Record:
         "inside_camera": float((sigmas < 1.96).mean()),
         "peer_mm": 1e3 * float(np.linalg.norm(peer[:3, 3] - CAMERA[:3, 3])),
         "peer_after_mm": 1e3 * rms(nominal),
-        "opencv_mm": best_of_opencv(commanded, seen),
-        "bound_mm": bound_mm(commanded, 1e-3 * arm_mm),
+        "opencv_mm": None if seen is None else best_of_opencv(commanded, seen),
+        "bound_mm": None if corner_px is not None else bound_mm(commanded, 1e-3 * arm_mm),
     }
+
+
+def images(board: Poses, corner_px: float, rng: np.random.Generator) -> Poses:
+    """(N, K, 5) corners in the plane of the board, m, and their pixels, NaN outside of the image."""
+    x, y = np.meshgrid(*(SQUARE_M * (np.arange(count) - (count - 1) / 2.0) for count in CORNERS), indexing="ij")
+    plane = np.stack([x, y, 0.0 * x], 2).reshape(-1, 3)
+    found = np.concatenate([np.broadcast_to(plane, (len(board), *plane.shape)), pixels(board, plane, LENS)], 2)
+    found[..., 3:] += corner_px * rng.normal(size=found[..., 3:].shape)
+    found[((found[..., 3:] < 0.0) | (found[..., 3:] > np.array(PIXELS) - 1.0)).any(2)] = np.nan
+    return found
+
+
+def pixels(board: Poses, plane: Poses, lens: Poses) -> Poses:
+    """(N, K, 2) of corners (K, 3), m, on boards (N, 4, 4) in the camera, by focal lengths and centre (4,), px."""
+    there = plane @ board[:, :3, :3].swapaxes(1, 2) + board[:, None, :3, 3]
+    return there[..., :2] / there[..., 2:] * lens[:2] + lens[2:]
+
+
+def bundle(flange: Poses, corners: Poses) -> tuple[Poses, Poses]:
+    """Camera in the flange and board in the base by bundle adjustment from the truth, a pinhole unknown too."""
+    shown, plane = ~np.isnan(corners[..., 3:]), np.nanmax(corners[..., :3], 0)
+
+    def missed(x: Poses) -> Poses:
+        camera, board = CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:12])
+        return (pixels(np.linalg.inv(flange @ camera) @ board, plane, LENS + FOCAL_PX * x[12:]) - corners[..., 3:])[
+            shown
+        ]
+
+    x = least_squares(missed, np.zeros(16), x_scale="jac").x
+    return CAMERA @ transform(x[:3], x[3:6]), BOARD @ transform(x[6:9], x[9:12])
+
+
+def solved(corners: Poses) -> Poses | None:
+    """Poses of the board by OpenCV and the true lens; None without OpenCV 4."""
+    cv2, found = opencv(), []
+    if cv2 is None:
+        return None
+    lens = np.array([[LENS[0], 0.0, LENS[2]], [0.0, LENS[1], LENS[3]], [0.0, 0.0, 1.0]])
+    for image in corners:
+        own = image[~np.isnan(image).any(1)]
+        _, turn, place = cv2.solvePnP(own[:, :3].copy(), own[:, 3:].copy(), lens, None)
+        found.append(transform(turn[:, 0], place[:, 0]))
+    return np.stack(found)
 
 
 def inputs_of(poses: Poses) -> Poses:
@@ -176,13 +230,19 @@ def bound_mm(flange: Poses, arm_m: float) -> float:
     return 1e3 * float(np.sqrt(found.diagonal()[3:6].sum()))
 
 
-def best_of_opencv(commanded: Poses, seen: Poses) -> float | None:
-    """Error of the best of OpenCV 4's methods, mm; OpenCV 5 has none."""
+def opencv() -> Any:
+    """OpenCV 4, which is optional; version 5 has no methods for hand-eye."""
     try:
-        cv2: Any = import_module("cv2")  # optional
+        found = import_module("cv2")
     except ImportError:
         return None
-    if not hasattr(cv2, "calibrateHandEye"):
+    return found if hasattr(found, "calibrateHandEye") else None
+
+
+def best_of_opencv(commanded: Poses, seen: Poses) -> float | None:
+    """Error of the best of OpenCV 4's methods, mm; None without it."""
+    cv2 = opencv()
+    if cv2 is None:
         return None
     split = [list(each) for own in (commanded, seen) for each in (own[:, :3, :3], own[:, :3, 3])]
     found = [cv2.calibrateHandEye(*split, method=method)[1][:, 0] for method in range(5)]
@@ -261,11 +321,11 @@ def field(machine: str, rows: int, seed: int) -> Record:
     mean, covariance = model.predict(dc.pose_inputs(robot, new), noise=False)
     away, before = true[:, None] - mean, error(new)
     return {
-        **{"machine": machine, "rows": rows, "arm_mm": None, "seed": seed},
+        **{"machine": machine, "rows": rows, "arm_mm": None, "corner_px": None, "seed": seed},
         "before_mm": 1e3 * rms(before - before.mean(0)),
         "after_mm": 1e3 * rms(away[:, 0].numpy()),
         "inside": covered(away, covariance),
-        **dict.fromkeys(COLUMNS[7:]),
+        **dict.fromkeys(COLUMNS[8:]),
     }
 
 
@@ -276,7 +336,8 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         for rows in (20,) if arguments.quick else (10, 20, 40, 80):
             for arm_mm in (0.3,) if arguments.quick else (0.0, 0.3, 1.0):
-                yield from (hand_eye(rows, arm_mm, seed) for seed in range(seeds))
+                for corner_px in (None, 0.3) if arguments.quick else (None, 0.1, 0.3):
+                    yield from (hand_eye(rows, arm_mm, seed, corner_px) for seed in range(seeds))
         for machine in MACHINES:
             for rows in (40,) if arguments.quick else (100, 400):
                 yield from (field(machine, rows, seed) for seed in range(seeds))

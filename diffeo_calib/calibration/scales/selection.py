@@ -23,6 +23,7 @@ from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
 from diffeo_calib.regression.factor import Factor
+from diffeo_calib.robots.cartesian import is_cartesian
 
 MESHING_LENGTHSCALE_RAD = 0.22
 """Default length scale of the transmission kernels on a circle: meshing of a reduction gear."""
@@ -79,6 +80,8 @@ class ScalePrior:
 
 
 SEARCH_LIMITS = SearchLimits()
+SHORT = 0.3
+"""Of the default length scales and noise."""
 SCALE_PRIOR = ScalePrior()
 
 
@@ -114,7 +117,7 @@ def select(
         centre: centre of the prior: the defaults.
         data: the measurements.
         start: where the search starts; by default it makes shorter searches from the defaults with each of several
-            transmission length scales.
+            transmission length scales, and for a machine with commanded places from short waves and little noise.
         seed: draws the subset of poses.
         limits: size of the search.
         progress: called as ``progress(task, done, total)``.
@@ -132,6 +135,10 @@ def select(
             usual = centre.transmission_lengthscale
             factors = [one / MESHING_LENGTHSCALE_RAD for one in TRANSMISSION_STARTS_RAD]
             starts = [replace(centre, transmission_lengthscale=usual * factor) for factor in factors]
+            if is_cartesian(data.nominal.geometry.chain):  # from the others, short waves look like noise
+                lengths = {"coupled_lengthscale": SHORT * centre.coupled_lengthscale}
+                noise = {"joint_noise": SHORT * centre.joint_noise, "sensor_noise": SHORT * centre.sensor_noise}
+                starts.append(replace(centre, **lengths, **noise))
             search.climb(starts, limits.first_iterations(subset.target.numel()))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
