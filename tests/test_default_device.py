@@ -115,7 +115,8 @@ def urdf_and_tables() -> list[Tensor]:
 
 
 ROBOTS: dict[str, Callable[[], Any]] = {
-    "chain": lambda: [mixed()(Q), mixed()(Q.tolist()), mixed().jacobian(Q), mixed().joint_frames(Q)],  # pyright: ignore[reportArgumentType]
+    "chain": lambda: [mixed()(Q), mixed().jacobian(Q), mixed().joint_frames(Q)],
+    "chain of lists": lambda: mixed()(Q.tolist()),  # pyright: ignore[reportArgumentType]
     "URDF and DH tables": urdf_and_tables,
     "geometry": derivatives,
     "gravity": sag,
