@@ -17,7 +17,7 @@ from typing import Any
 import jsonschema
 import pytest
 import torch
-from command_bank import Command, Outcome, leave_undrawn
+from command_bank import STAGES, Command, Outcome, leave_undrawn
 from kind_bank import (
     FREE,
     KINDS,
@@ -318,6 +318,7 @@ def _(bench: Bench) -> None:
     table, options = kind.table()
     found = bench.json("report", kind.file, "-o", path, "--data", table, *options)
     assert found["left_out"]
+    assert tuple(found["errors"]) in ((), STAGES)
     assert "<svg" in path.read_text(encoding="utf-8")
 
 
@@ -334,6 +335,7 @@ def _(bench: Bench) -> None:
     )
     assert len(table_rows(path)) == 3
     assert len(planned["expected_rms_m"]) == 4
+    assert planned["expected_rms_m"] == sorted(planned["expected_rms_m"], reverse=True)
     assert "tracker" not in json.dumps(planned) or kind.name not in FREE
 
 
