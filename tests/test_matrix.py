@@ -142,6 +142,9 @@ FORMS = (
     "images of a board",
 )
 """Kinds whose models differ in form: in their markers, tips, poses, payload and tool."""
+PROPOSED = ("several tips", "distances", "images", "camera on the tool", "two cameras")
+"""Kinds of tables of which tests/cli/test_campaign.py and tests/calibration/test_two_cameras.py test the `init`, which
+takes a quarter of a minute for some of them."""
 Verb = Callable[[Bench], None]
 VERBS: dict[str, tuple[Verb, tuple[str, ...]]] = {}
 """Name -> function, and the kinds that differ for it."""
@@ -409,7 +412,7 @@ def _(bench: Bench) -> None:
         assert_close(program(q), kind.model(q).detach(), rtol=0, atol=1e-9)
 
 
-@verb("init")
+@verb("init", *(name for name in KINDS if name not in PROPOSED))
 def _(bench: Bench) -> None:
     path = bench.folder / "campaign.toml"
     table, options = bench.kind.table()
