@@ -103,7 +103,7 @@ def measured() -> list[Tensor]:
     return [q, points, arm.gravity_torques(q), found.transmission, found.gravity, found.geometry]
 
 
-def constants(chain: Chain) -> list[Tensor]:
+def constants(chain: dc.Tree) -> list[Tensor]:
     described = chain.limits, chain.coupling, chain.coupling_offset, chain.axes, chain.offsets, chain.tip_offsets[0]
     return [*described, chain.motion_terms, torch.tensor(chain.reach, dtype=torch.float64, device="cpu")]
 
@@ -236,7 +236,8 @@ def registration(model: dc.CalibratedKinematics, case: Case, _: Path) -> list[An
 
 def rows_of_a_table(model: dc.CalibratedKinematics, case: Case, _: Path) -> list[Any]:
     data = dc.Measurements(case.test.q[:4], case.test.points[:4], std=1e-4)
-    return [data.q, data[1:3].std, data.split(0.5)[0].q, data.groups(), dc.evaluate(model, data).errors]
+    found: Any = dc.evaluate(model, data)
+    return [data.q, data[1:3].std, data.split(0.5)[0].q, data.groups(), found.errors]
 
 
 @pytest.mark.slow

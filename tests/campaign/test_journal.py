@@ -249,7 +249,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     (tmp_path / "run.csv").write_text("".join([*lines[:3], "1,2,three\n", *lines[3:]]))
     assert "changed after" in command(*words).error
     (tmp_path / "run.csv").write_text("".join([*lines[:22], "1,2,three\n", *lines[22:]]))
-    done = command(*words, "--accepted", tmp_path / "accepted.csv", "--target", "50mm")
+    done = command(*words, "--accepted", tmp_path / "accepted.csv")
     assert done.code == 0
     assert "going on after 14 lines" in done.out
     assert "row 15 " not in done.out
@@ -257,6 +257,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     assert "line 23 left out" in done.out
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
+    assert command(*words, "--target", "50mm").code == 0
 
 
 def test_rows_that_are_there_before_are_judged_as_with_once(
