@@ -8,12 +8,20 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, from_dh
-from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.robots.se3 import rotation, twist_transform
 
 
 def draw(*shape: int, seed: int = 0, size: float = 1.0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return size * torch.randn(*shape, dtype=torch.float64, device="cpu", generator=generator)
+
+
+def tool_frame() -> Tensor:
+    """A tool 0.25 m from the flange, tilted."""
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, :3] = rotation(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
+    frame[:3, 3] = torch.tensor([0.15, -0.12, 0.16], dtype=torch.float64)
+    return frame
 
 
 def crooked(kinds: list[str], mimic: dict[int, dict[str, float]] | None = None) -> Chain:

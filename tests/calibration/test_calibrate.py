@@ -207,24 +207,18 @@ def test_given_scales_are_used(arm: Case) -> None:
     assert float((other.model(arm.test.q) - arm.model(arm.test.q)).abs().max()) > 1e-6
 
 
-@pytest.mark.parametrize("rows", [8, 11])
+@pytest.mark.parametrize("rows", [3, 6, 11])
 def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
-    arm, train, _ = simulated(rows)
+    """And are not worse than the registration."""
+    arm, train, test = simulated(rows)
     with pytest.warns(DiffeoCalibWarning, match=rf"^{rows} poses are too few to select scales: .*at least 12 poses"):
         result = dc.calibrate(arm.nominal, train)
     assert f"{rows} poses are too few" in result.status
     assert result.fit.converged
     assert result.fit.coupling_residual <= CERTIFICATE
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rows", [4, 6])
-def test_very_few_poses_still_give_a_sound_fit(rows: int) -> None:
-    arm, train, test = simulated(rows)
-    with pytest.warns(DiffeoCalibWarning, match="poses are too few to select scales"):
-        result = dc.calibrate(arm.nominal, train)
-    assert result.fit.converged
-    assert dc.evaluate(result.model, test).rms < 1.2 * dc.evaluate(result.registration.geometry.points, test).rms
+    assert result.outliers == []
+    assert dc.evaluate(result.model, test).rms < 1.1 * dc.evaluate(result.registration.geometry.points, test).rms
+    assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
 
 
 def test_twelve_poses_are_selected_on(twelve: Watched, arm: Case) -> None:

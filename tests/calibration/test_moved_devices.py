@@ -33,9 +33,10 @@ def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
 
 
 def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int]:
-    """Distance in mm and row, as the warning reports them."""
+    """Distance in mm and row, as the warning reports them, which points at the caller."""
     with pytest.warns(DiffeoCalibWarning, match=MOVED) as caught:
         dc.calibrate(robot, data)
+    assert {w.filename for w in caught} == {__file__}
     (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
     assert text.startswith(what)
     words = text.split()

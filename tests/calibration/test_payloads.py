@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from product_bank import with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -62,7 +63,7 @@ def test_sag_under_other_payloads_is_predicted(
     arm: SimulatedArm, rows: dc.Measurements, result: dc.CalibrationResult, other: dc.Measurements
 ) -> None:
     assert result.fit.converged
-    without = dc.calibrate(arm.nominal, rows.with_payload(None))
+    without = dc.calibrate(arm.nominal, rows.with_payload(None), hyperparameters=result.selection.scales)
     errors = dc.evaluate(result.model, other).rms, dc.evaluate(without.model, other.with_payload(None)).rms
     assert errors[0] < 0.5 * errors[1]
     unknown = arm.true_points(other.q, 10.0) - arm.true_points(other.q, 0.0)
@@ -149,7 +150,7 @@ def test_payloads_that_cannot_be(arm: SimulatedArm, rows: dc.Measurements) -> No
         rows.with_payload([1.0, 2.0])
 
 
-def test_one_payload_in_all_rows_is_warned_about(arm: SimulatedArm, rows: dc.Measurements) -> None:
+def test_one_payload_in_all_rows_is_warned_about(arm: SimulatedArm) -> None:
     q, points = arm.measure(14, seed=4)
     with pytest.warns(DiffeoCalibWarning, match="all rows carry the same payload"):
-        dc.calibrate(arm.nominal, dc.Measurements(q, points).with_payload(6.0))
+        with_usual_scales(arm.nominal, dc.Measurements(q, points).with_payload(6.0))

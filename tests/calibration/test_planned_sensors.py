@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,8 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 STEP = 1e-6
+ARM = SimulatedArm(seed=0)
+"""That of the bank's readings."""
 NEW = {
     "distance": dc.Sensor.distances(reading_bank.POINTS),
     "height": dc.Sensor.heights([[0.0, 0.0, 2.0, 0.1], [0.8, 0.0, 0.6, 0.3], [0.0, 1.0, 0.0, 0.2]]),
@@ -32,11 +33,8 @@ NEW = {
 }
 
 
-@cache
 def fitted(kind: str) -> Any:
-    arm = SimulatedArm(seed=1)
-    data = reading_bank.readings(arm, kind, 60, noise=2e-5)
-    return dc.calibrate(arm.nominal, data, hyperparameters=reading_bank.scales())
+    return kind_named(f"{kind}s").result
 
 
 def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,7 +86,7 @@ def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[floa
 def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
     """Where the devices are and what their rows share is read off the map."""
     result = fitted(kind)
-    q = SimulatedArm(seed=1).sample(20, seed=8)
+    q = ARM.sample(20, seed=8)
     plan = dc.plan(result.model, q, 5)
     sensors: Any = sensor_of(result.model)
     known = result.placement[0].devices.constants
@@ -102,7 +100,7 @@ def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
 def test_planned_rows_beat_random_rows_for_the_same_devices(kind: str) -> None:
-    model, q = fitted(kind).model, SimulatedArm(seed=1).sample(150, seed=8)
+    model, q = fitted(kind).model, ARM.sample(150, seed=8)
     sensor = NEW[kind]
     best = float(dc.plan(model, q, 12, target=q, sensor=sensor).expected_rms[-1])
     random = [float(dc.plan(model, q[k : k + 12], 12, target=q, sensor=sensor).expected_rms[-1]) for k in (0, 30, 60)]
@@ -114,7 +112,7 @@ def test_planned_rows_beat_random_rows_for_the_same_devices(kind: str) -> None:
 
 def test_the_tracker_of_a_model_without_device_stands_anywhere() -> None:
     """Its first two rows say where it stands; nothing was known about that."""
-    q = SimulatedArm(seed=1).sample(60, seed=8)
+    q = ARM.sample(60, seed=8)
     rms = dc.plan(fitted("distance").model, q, 12, sensor=dc.Sensor.positions()).expected_rms
     assert float(rms[1]) > 0.999 * float(rms[0])
     assert float(rms[12]) < 0.6 * float(rms[0])
@@ -144,8 +142,7 @@ def test_a_camera_measures_what_it_sees() -> None:
 
 def test_expected_errors_of_distances_come_true() -> None:
     """15 more planned distances to the same fixed points, measured in simulation and fitted."""
-    arm, result = SimulatedArm(seed=1), fitted("distance")
-    q = arm.sample(300, seed=11)
+    result, q = fitted("distance"), ARM.sample(300, seed=11)
     plan = dc.plan(result.model, q, 15)
     devices: Any = result.placement[0].devices
     sensors: Any = sensor_of(result.model)
@@ -153,12 +150,12 @@ def test_expected_errors_of_distances_come_true() -> None:
     numbers = [int((devices.constants[:, :3] - where[name]).norm(dim=1).argmin()) for name in plan.devices]
     names = [devices.names[number] for number in numbers]
     which = torch.tensor([int(name.split()[1]) for name in names])
-    lengths = (reading_bank.in_base(arm, plan.q) - reading_bank.POINTS[which]).norm(dim=1)
-    new = dc.Readings.distances(plan.q, lengths, names, arm.nominal.joint_names)
-    both = dc.Readings.joined([reading_bank.readings(arm, "distance", 60, noise=2e-5), new])
-    again = dc.calibrate(arm.nominal, both, hyperparameters=reading_bank.scales()).model
+    lengths = (reading_bank.in_base(ARM, plan.q) - reading_bank.POINTS[which]).norm(dim=1)
+    new = dc.Readings.distances(plan.q, lengths, names, ARM.nominal.joint_names)
+    both = dc.Readings.joined([kind_named("distances").data, new])
+    again = dc.calibrate(ARM.nominal, both, hyperparameters=reading_bank.scales()).model
     for model, expected in ((result.model, plan.expected_rms[0]), (again, plan.expected_rms[-1])):
-        assert 0.4 < rigid_rms(model(q).detach(), arm.true_points(q)) / float(expected) < 1.6
+        assert 0.4 < rigid_rms(model(q).detach(), ARM.true_points(q)) / float(expected) < 1.6
 
 
 @pytest.mark.parametrize("name", marked("heights", "images and a tracker", "several kinds", "inclinations"))

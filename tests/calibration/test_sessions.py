@@ -17,7 +17,6 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.cli import record
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
@@ -123,14 +122,6 @@ def test_names_of_sessions(names: Any) -> None:
     with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
         data.with_sessions(names)
     assert data.with_sessions([" a", "a "] * 3).session_names == ("a",)
-
-
-def test_a_model_of_sessions_is_saved(arm: SimulatedArm, result: dc.CalibrationResult, tmp_path: Path) -> None:
-    dc.save(result.model, tmp_path / "arm.safetensors")
-    again, q = dc.load(tmp_path / "arm.safetensors"), arm.sample(20, seed=4)
-    for ours, theirs in zip(result.model.predict(q), again.predict(q), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
-    np.testing.assert_allclose(load_numpy(tmp_path / "arm.safetensors")(q.numpy()), again(q).numpy(), atol=1e-11)
 
 
 def test_poses_in_several_sessions(arm: SimulatedArm) -> None:

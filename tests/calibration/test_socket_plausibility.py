@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from product_bank import with_usual_scales
 from simulated_sockets import SocketRows, rest_in_sockets
 
 import diffeo_calib as dc
@@ -152,9 +153,10 @@ def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: o
     assert data.sha256 != table(rows, distance_std=1e-5).sha256
     names = tuple(reversed(rows.names))
     assert data.sha256 != table(rows, names).sha256
-    tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(15, seed=2)))
-    with pytest.raises(InputError, match="calibrated with measured positions"):
-        tracked.model.registered(data)
+    tracked = with_usual_scales(arm.nominal, dc.Measurements(*arm.measure(15, seed=2))).model
+    for verb in (dc.evaluate, dc.CalibratedKinematics.registered):
+        with pytest.raises(InputError, match="calibrated with measured positions"):
+            verb(tracked, data)
     with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
     with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):

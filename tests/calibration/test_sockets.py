@@ -2,9 +2,7 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from reading_bank import scales
@@ -17,10 +15,8 @@ from diffeo_calib.calibration.identification.registration import register_socket
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import held_parameters
 from diffeo_calib.calibration.placing.sockets import SocketDevices
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
@@ -240,14 +236,6 @@ def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Me
     assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
 
 
-def test_models_are_saved_whole(result: dc.CalibrationResult, arm: SimulatedArm, tmp_path: Path) -> None:
-    dc.save(result.model, tmp_path / "arm.safetensors")
-    again, q = dc.load(tmp_path / "arm.safetensors"), arm.sample(20, seed=4)
-    for ours, theirs in zip(result.model.predict(q), again.predict(q), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
-    np.testing.assert_allclose(load_numpy(tmp_path / "arm.safetensors")(q.numpy()), again(q).numpy(), atol=1e-11)
-
-
 def test_tools_without_rigid_motions(result: dc.CalibrationResult, arm: SimulatedArm) -> None:
     """The robot's base is the measuring frame: a tool is known as well in both."""
     q, ball = arm.sample(5, seed=6), result.model.geometry.tool[0]
@@ -272,9 +260,3 @@ def test_registered_where_a_tracker_stands(arm: SimulatedArm, result: dc.Calibra
     names = arm.nominal.joint_names
     seen = result.model.registered(dc.Measurements(q[:10], points[:10], names))
     assert dc.evaluate(seen, dc.Measurements(q[10:], points[10:], names)).rms < 7e-4
-
-
-def test_a_model_of_a_marker_does_not_know_the_ball(arm: SimulatedArm, data: dc.Measurements) -> None:
-    tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(20, seed=2), arm.nominal.joint_names))
-    with pytest.raises(InputError, match="calibrated with measured positions"):
-        dc.evaluate(tracked.model, data)

@@ -26,17 +26,6 @@ def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
 # --- few and many ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rows", [3, 7])
-def test_few_poses_fall_back_and_are_not_worse_than_the_registration(rows: int) -> None:
-    arm, train, test = simulated(rows)
-    with pytest.warns(DiffeoCalibWarning, match=rf"^{rows} poses are too few to select scales: defaults are used"):
-        result = dc.calibrate(arm.nominal, train)
-    assert result.fit.converged
-    assert result.outliers == []
-    assert held_out(result, test) < 1.1 * dc.evaluate(result.registration.geometry.points, test).rms
-    assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
-
-
 def test_few_poses_with_many_repeats_are_few_poses() -> None:
     """Repeats determine the noise, not the robot: its 95 % regions have to stay wide."""
     arm, train, test = simulated(8)
@@ -148,9 +137,9 @@ def test_few_poses_with_honest_deviations_are_not_refused(rows: int) -> None:
 
 def test_orientation_errors_fall_below_those_of_geometry(posed: Case) -> None:
     errors = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
-    assert errors[2].rms < 0.2 * errors[1].rms
+    assert errors[2].rms < 0.2 * errors[1].rms < 0.2 * errors[0].rms
     angles = [inf if found.angle_rms is None else found.angle_rms for found in errors]
-    assert angles[2] < 0.4 * angles[1] < inf
+    assert angles[2] < 0.4 * angles[1] <= 0.4 * angles[0] < inf
     assert angles[2] < 0.03  # the noise of three points with 0.02 mm at 0.1 m is 0.016 deg
     assert 1e-5 < float(posed.result.selection.scales.rotation_noise) < 5e-4
 

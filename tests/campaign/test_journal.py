@@ -266,14 +266,14 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     """Also without a row that comes later; a line that cannot be read is named by its place in the table."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
-    (tmp_path / "run.csv").write_text("".join([*lines[:18], wrong, *lines[18:20], "x" + lines[20]]))
+    (tmp_path / "run.csv").write_text("".join([*lines[:16], wrong, *lines[16:18], "x" + lines[18]]))
     accepted = []
     for how in ("--once", "--stdin"):
         done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
         assert done.code == 0
-        assert "row 19 looks wrong" in done.out
+        assert "row 17 looks wrong" in done.out
         assert "mm expected" in done.out
-        assert "run.csv', line 22" in done.out
+        assert "run.csv', line 20" in done.out
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
     assert accepted[0] == accepted[1]

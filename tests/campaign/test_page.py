@@ -24,7 +24,7 @@ from diffeo_calib.robots import SimulatedArm
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ARM = SimulatedArm(3)
-UPDATES = int(os.environ.get("CAMPAIGN_UPDATES", "200"))
+UPDATES = int(os.environ.get("CAMPAIGN_UPDATES", "80"))
 """3600: an hour with a row each second."""
 SHOWN = """async (text) => {
   while (document.querySelector("#state").textContent !== text) await new Promise((done) => setTimeout(done, 3));

@@ -157,12 +157,9 @@ def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
     assert words[words.index("--distance") + 1] == "a,b=50"
 
 
-def test_sockets_of_a_panda(tmp_path: Path, command: Command) -> None:
+def test_sockets_of_a_panda(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
     """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if folder is None:
-        pytest.skip("real measurements are not here: set DIFFEO_CALIB_DATA")
-    data = Path(folder) / "mukca"
+    data = ur10_folder.parent / "mukca"
     done = command("init", data / "panda_3.csv", data / "panda.urdf", "-o", tmp_path / "c.toml")
     assert done.code == 0, done.err
     assert tomllib.loads((tmp_path / "c.toml").read_text())["angle"] == "rad"
@@ -216,13 +213,11 @@ def test_names_of_positions() -> None:
     assert guess_positions(["X", "Y", "Z", "x2", "y2", "z2"]) == ([["X", "Y", "Z"], ["x2", "y2", "z2"]], [])
 
 
-def test_the_ur10(tmp_path: Path, command: Command) -> None:
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if folder is None:
-        pytest.skip("real measurements are not here: set DIFFEO_CALIB_DATA")
-    data = Path(folder) / "ipa_ur10"
-    assert guess_sheet(data / "measurements_iso_cubes.csv").decimal == ","
-    done = command("init", data / "measurements_iso_cubes.csv", data / "ur10_robot.urdf", "-o", tmp_path / "ur.toml")
+def test_the_ur10(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
+    assert guess_sheet(ur10_folder / "measurements_iso_cubes.csv").decimal == ","
+    done = command(
+        "init", ur10_folder / "measurements_iso_cubes.csv", ur10_folder / "ur10_robot.urdf", "-o", tmp_path / "ur.toml"
+    )
     assert done.code == 0, done.err
     text = (tmp_path / "ur.toml").read_text()
     for line in (

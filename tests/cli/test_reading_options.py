@@ -34,6 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     fitted = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "-o", "m.safetensors", "--json", "m.json")
@@ -129,6 +130,7 @@ def test_refused(
     assert not Path("none.safetensors").exists()
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_readings_that_no_place_explains_are_warned_of(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

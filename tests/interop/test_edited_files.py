@@ -96,15 +96,13 @@ def test_missing_entries(key: str, editor: Editor) -> None:
     assert "not understood" in refused(editor.write(lambda header, _: header.pop(key)))
 
 
-@pytest.mark.parametrize("key", ["lower", "mimic", "mimic_offset"])
-def test_missing_entries_of_a_joint(key: str, editor: Editor) -> None:
-    edited = editor.write(lambda header, _: header["nominal"]["joints"][0].pop(key))
+@pytest.mark.parametrize("key", ["lower", "mimic", "mimic_offset", "elastic"])
+def test_missing_entries_of_a_joint_and_of_elasticity(key: str, editor: Editor) -> None:
+    def without(header: Any, _: Any) -> None:
+        (header["nominal"] if key == "elastic" else header["nominal"]["joints"][0]).pop(key)
+
+    edited = editor.write(without)
     assert f"do not fit together ('{key}')" in refused(edited)
-
-
-def test_missing_entry_of_elasticity(editor: Editor) -> None:
-    edited = editor.write(lambda header, _: header["nominal"].pop("elastic"))
-    assert "do not fit together ('elastic')" in refused(edited)
 
 
 @pytest.mark.parametrize("name", [*model_header.MOMENTA, *model_header.GEOMETRY])

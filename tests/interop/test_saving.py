@@ -1,9 +1,8 @@
-"""Saving models: what cannot be written, and files that survive a failed attempt."""
+"""Saving models: what cannot be written, and files that survive a failed attempt, see tests/common/test_files.py."""
 
 from __future__ import annotations
 
 import os
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,6 @@ from model_file_bank import Editor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-
-
-def test_saving_into_a_missing_folder(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none.*cannot be written .*No such file or directory.*make its folder first"):
-        dc.save(small, tmp_path / "none" / "model.safetensors")
-    assert not (tmp_path / "none").exists()
 
 
 def test_saving_over_a_folder(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
@@ -59,14 +52,3 @@ def test_a_failing_save_leaves_the_old_file(
         dc.save(model, editor.path)
     assert editor.path.read_bytes() == sound
     assert [path.name for path in editor.path.parent.iterdir()] == [editor.path.name]
-
-
-def test_an_existing_file_keeps_its_permissions_and_its_link(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    path, link = tmp_path / "model.safetensors", tmp_path / "link"
-    path.write_text("old")
-    path.chmod(0o640)
-    link.symlink_to(path.name)
-    dc.save(small, link)
-    assert link.is_symlink()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
-    assert isinstance(dc.load(path), dc.CalibratedKinematics)

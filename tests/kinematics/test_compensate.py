@@ -9,24 +9,16 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case
+from robots_bank import tool_frame
 from scipy.optimize import least_squares
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.robots.se3 import rotation
 
 BOUND = radians(1.0)
 LEVER = 0.1
-
-
-def tool_frame() -> Tensor:
-    """A tool 0.25 m from the flange, tilted."""
-    frame = torch.eye(4, dtype=torch.float64)
-    frame[:3, :3] = rotation(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
-    frame[:3, 3] = torch.tensor([0.15, -0.12, 0.16], dtype=torch.float64)
-    return frame
 
 
 def commands(case: Case, rows: int, seed: int = 0) -> Tensor:

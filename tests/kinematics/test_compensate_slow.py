@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case, with_usual_scales
-from test_compensate import BOUND, commands, inside, intended, misses, near_wrist_singularity, tool_frame
+from robots_bank import tool_frame
+from test_compensate import BOUND, commands, inside, intended, misses, near_wrist_singularity
 
 import diffeo_calib as dc
 from diffeo_calib.robots.geometry import Geometry

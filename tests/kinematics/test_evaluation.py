@@ -125,15 +125,6 @@ def test_angles_are_shown_in_degrees() -> None:
 
 
 @pytest.mark.slow
-def test_stages_of_a_calibration_with_poses(posed: Case) -> None:
-    found = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
-    assert found[0].rms > found[1].rms > found[2].rms
-    angles = [evaluation.angle_rms for evaluation in found]
-    assert angles[0] is not None
-    assert angles == sorted(angles, reverse=True)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
-@pytest.mark.slow
 def test_poses_and_points_are_not_confused(arm: Case, posed: Case) -> None:
     points = dc.Measurements(posed.test.q, posed.test.points)  # three markers, as far as shapes go
     with pytest.raises(InputError, match=r"calibrated with poses: expected measured poses, got points; name the"):

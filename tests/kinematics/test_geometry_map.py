@@ -143,14 +143,6 @@ def test_parameters_per_row_are_those_of_each_row(chain: Chain) -> None:
         torch.testing.assert_close(function(x, theta), expected, rtol=1e-13, atol=1e-14)
 
 
-@every_chain
-def test_the_same_parameters_in_every_row(chain: Chain) -> None:
-    geometry, x = geometry_of(chain, 3), draw(N, chain.n, seed=15)
-    theta = draw(geometry.size, seed=16, size=0.3)
-    for function in (geometry.points, geometry.jacobian, geometry.sensitivities):
-        torch.testing.assert_close(function(x, theta.expand(N, -1)), function(x, theta), rtol=1e-13, atol=1e-14)
-
-
 def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
     geometry, x = geometry_of(CHAINS["mimic joints"]), draw(3, CHAINS["mimic joints"].n, seed=17)
     theta = draw(3, geometry.size, seed=18, size=0.3).requires_grad_()

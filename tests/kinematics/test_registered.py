@@ -218,28 +218,20 @@ def test_a_model_that_is_dense_stays_dense(arm: Case, monkeypatch: pytest.Monkey
         assert len(arm.model.registered(rows).configurations) == len(arm.model.configurations) + more
 
 
-def test_one_wrong_row_of_eight(arm: Case) -> None:
-    T = transform(10)
-    data = seen(arm, slice(0, 8), T)
+@pytest.mark.parametrize("wrong", [{3: (0.0, 0.02, 0.0)}, {3: (0.0, 0.01, 0.0), 7: (-0.3, -0.3, -0.3)}])
+def test_wrong_rows_take_no_part(wrong: dict[int, tuple[float, ...]], arm: Case) -> None:
+    """One of eight, and two of twelve."""
+    T, rows = transform(9 + len(wrong)), 4 + 4 * len(wrong)
+    data = seen(arm, slice(0, rows), T)
     points = data.points.clone()
-    points[3, 0, 1] += 0.02
-    wrong = dc.Measurements(data.q, points)
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"1 row\(s\) contradict all others and took no part: row 3;"):
-        found = arm.model.registered(wrong)
-    assert record(found).outliers == (3,)
-    assert record(found).rows == 7
-    assert rms(found, seen(arm, slice(8, None), T)) < 1.5 * rms(arm.model, arm.test)
-
-
-def test_two_wrong_rows_of_twelve(arm: Case) -> None:
-    T = transform(11)
-    data = seen(arm, slice(0, 12), T)
-    points = data.points.clone()
-    points[3, 0, 1] += 0.01
-    points[7, 0] -= 0.3
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 row\(s\) contradict all others and took no part: row 3, 7;"):
+    for row, shift in wrong.items():
+        points[row, 0] += torch.tensor(shift, dtype=points.dtype)
+    words = rf"{len(wrong)} row\(s\) contradict all others and took no part: row {', '.join(map(str, wrong))};"
+    with pytest.warns(dc.DiffeoCalibWarning, match=words):
         found = arm.model.registered(dc.Measurements(data.q, points))
-    assert rms(found, seen(arm, slice(12, None), T)) < 1.5 * rms(arm.model, arm.test)
+    assert record(found).outliers == tuple(wrong)
+    assert record(found).rows == rows - len(wrong)
+    assert rms(found, seen(arm, slice(rows, None), T)) < 1.5 * rms(arm.model, arm.test)
 
 
 def test_a_tool_that_never_turned(arm: Case) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from product_bank import Case, simulated
+from robots_bank import tool_frame
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -15,18 +16,9 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.tool import tool_points
 from diffeo_calib.measurements.poses import angle_between, mark_points, pose_directions, poses_from_marks
-from diffeo_calib.robots.se3 import rotation
 
 LEVER = 0.1
 FRAMES = ("base", "measuring")
-
-
-def tool_frame() -> Tensor:
-    """A tool 0.25 m from the flange, tilted."""
-    frame = torch.eye(4, dtype=torch.float64)
-    frame[:3, :3] = rotation(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
-    frame[:3, 3] = torch.tensor([0.15, -0.12, 0.16], dtype=torch.float64)
-    return frame
 
 
 def true_poses(rows: int, markers: int, q: Tensor, tool: Tensor) -> Tensor:

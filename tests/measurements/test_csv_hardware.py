@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,12 +27,8 @@ UR10_JOINTS = [
 
 
 @pytest.fixture(scope="module")
-def ur10() -> Measurements:
-    """632 poses of a UR10, measured with a laser tracker."""
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if not folder or not (Path(folder) / "ipa_ur10").is_dir():
-        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
-    path = Path(folder) / "ipa_ur10" / "measurements_iso_cubes.csv"
+def ur10(ur10_folder: Path) -> Measurements:
+    path = ur10_folder / "measurements_iso_cubes.csv"
     position = ["measurement_x", "measurement_y", "measurement_z"]
     return read_measurements(path, UR10_JOINTS, position, length="mm", angle="rad", sep=";", decimal=",")
 
@@ -47,13 +42,6 @@ UR10_POSES: dict[str, Any] = {
 }
 
 
-def hardware_folder(name: str) -> Path:
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if not folder or not (Path(folder) / name).is_dir():
-        pytest.skip(f"needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds {name}/")
-    return Path(folder) / name
-
-
 def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tensor:
     """How far turns between poses differ, measured against nominal: neither base nor tool frame matters for angles."""
     first, others = measured[:1, :3, :3], measured[1:, :3, :3]
@@ -62,9 +50,9 @@ def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tens
     return turned.abs()
 
 
-def test_ur10_poses_are_read(ur10: Measurements) -> None:
+def test_ur10_poses_are_read(ur10: Measurements, ur10_folder: Path) -> None:
     """The convention is right: turns between poses are those between the commanded flange poses."""
-    path = hardware_folder("ipa_ur10") / "measurements_iso_cubes.csv"
+    path = ur10_folder / "measurements_iso_cubes.csv"
     position = ["measurement_x", "measurement_y", "measurement_z"]
     options: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
     data = read_measurements(path, UR10_JOINTS, position, **options, **UR10_POSES)
@@ -86,9 +74,9 @@ def test_ur10_poses_are_read(ur10: Measurements) -> None:
     assert len(held(train.poses)) + len(held(test.covariance)) == 632
 
 
-def test_fr3_poses_are_read() -> None:
+def test_fr3_poses_are_read(ur10_folder: Path) -> None:
     """Matrices of a camera, against those that the controller reports."""
-    path = hardware_folder("franka_fr3") / "franka_fr3_camera.csv"
+    path = ur10_folder.parent / "franka_fr3" / "franka_fr3_camera.csv"
     joints = [f"q{i}_rad" for i in range(1, 8)]
     matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
     options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}

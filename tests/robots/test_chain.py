@@ -1,6 +1,5 @@
 """Chains: poses and Jacobians against Pinocchio, derivatives, shapes, messages."""
 
-import os
 import re
 from math import inf, nan, pi
 from pathlib import Path
@@ -41,18 +40,11 @@ CROOKED = """<robot name="crooked">
 </robot>"""
 
 
-def hardware_urdf() -> Path:
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if not folder:
-        pytest.skip("needs the measured robots: set DIFFEO_CALIB_DATA to their folder")
-    return Path(folder) / "ipa_ur10" / "ur10_robot.urdf"
-
-
 @pytest.fixture(params=["crooked", "crooked from the middle", "simulated arm", "ur10"])
 def case(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str, str]:
     path = tmp_path / "robot.urdf"
     if request.param == "ur10":
-        return hardware_urdf(), "base_link", "ee_link"
+        return request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "base_link", "ee_link"
     if request.param == "simulated arm":
         SimulatedArm().write_urdf(path)
         return path, "base_link", "flange"

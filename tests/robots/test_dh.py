@@ -1,6 +1,5 @@
 """Denavit-Hartenberg tables, in both conventions."""
 
-import os
 import re
 from dataclasses import replace
 from math import cos, nan, pi, sin
@@ -86,11 +85,8 @@ def test_tuples_are_rows() -> None:
     assert (chain.name, chain.joint_names) == ("table", ("a", "b", "c"))
 
 
-def test_ur10_table_and_urdf_are_one_robot() -> None:
-    folder = os.environ.get("DIFFEO_CALIB_DATA")
-    if not folder:
-        pytest.skip("needs the measured robots: set DIFFEO_CALIB_DATA to their folder")
-    urdf = load_urdf(Path(folder) / "ipa_ur10" / "ur10_robot.urdf", "base_link", "ee_link")
+def test_ur10_table_and_urdf_are_one_robot(ur10_folder: Path) -> None:
+    urdf = load_urdf(ur10_folder / "ur10_robot.urdf", "base_link", "ee_link")
     q = 6 * torch.rand(50, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 3
     table = turn_z(pi) @ from_dh(UR10)(q)
     constant = torch.linalg.inv(table) @ urdf(q)

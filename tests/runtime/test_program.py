@@ -37,16 +37,19 @@ def equal(found: np.ndarray, expected: Tensor, tolerance: float = 1e-12) -> None
     torch.testing.assert_close(torch.from_numpy(found), expected, rtol=0, atol=tolerance)
 
 
-@every_chain
-@pytest.mark.parametrize("elastic", [True, False])
-def test_points_and_jacobian(chain: Chain, elastic: bool) -> None:
-    deformation = deformation_of(chain, elastic=elastic)
-    q, program = draw(ROWS, chain.n, seed=5, size=3.0), made(deformation)
-    expected, slopes = deformation(q).unflatten(1, (-1, 3)), deformation.jacobian(q).unflatten(1, (-1, 3))
+def agree(program: Program, deformation: GeodesicDeformation, q: Tensor) -> None:
+    expected, slopes = (found.unflatten(1, (-1, 3)) for found in (deformation(q), deformation.jacobian(q)))
     equal(program.points(q.numpy()), expected)
     points, jacobian = program.points_and_jacobian(q.numpy())
     equal(points, expected)
     equal(jacobian, slopes, 1e-9)  # the derivative of tables
+
+
+@every_chain
+@pytest.mark.parametrize("elastic", [True, False])
+def test_points_and_jacobian(chain: Chain, elastic: bool) -> None:
+    deformation = deformation_of(chain, elastic=elastic)
+    agree(made(deformation), deformation, draw(ROWS, chain.n, seed=5, size=3.0))
 
 
 def test_waves_of_gears() -> None:
@@ -55,8 +58,7 @@ def test_waves_of_gears() -> None:
         chain = CHAINS[name]
         deformation = deformation_of(chain, waves=True)
         q, program = draw(ROWS, chain.n, seed=5, size=9.0), made(deformation)
-        equal(program.points(q.numpy()), deformation(q).unflatten(1, (-1, 3)))
-        equal(program.points_and_jacobian(q.numpy())[1], deformation.jacobian(q).unflatten(1, (-1, 3)), 1e-9)
+        agree(program, deformation, q)
         still = replace(program, chain=replace(program.chain, waves=None))
         assert np.abs(still.points(q.numpy()) - program.points(q.numpy())).max() > 1e-3
 
@@ -65,9 +67,7 @@ def test_waves_of_gears() -> None:
 def test_every_profile(profile: Profile) -> None:
     chain = CHAINS["arm"]
     deformation = deformation_of(chain, profile, integrator=dc.RK8(1))
-    q, program = draw(ROWS, chain.n, seed=5, size=3.0), made(deformation)
-    equal(program.points(q.numpy()), deformation(q).unflatten(1, (-1, 3)))
-    equal(program.points_and_jacobian(q.numpy())[1], deformation.jacobian(q).unflatten(1, (-1, 3)), 1e-9)
+    agree(made(deformation), deformation, draw(ROWS, chain.n, seed=5, size=3.0))
 
 
 @every_chain

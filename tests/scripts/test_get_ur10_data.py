@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import shlex
 import subprocess
 import sys
@@ -176,15 +175,12 @@ def test_as_a_program_without_the_package(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_the_published_file(tmp_path: Path) -> None:
+def test_the_published_file(ur10_folder: Path, tmp_path: Path) -> None:
     """The real table passes the check, and the robot of the descriptor is the URDF's robot."""
-    given = os.environ.get("DIFFEO_CALIB_DATA")
-    if not given or not (Path(given) / "ipa_ur10" / get_ur10_data.FILE).is_file():
-        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
-    get_ur10_data.main([str(tmp_path), "--from", given])
+    get_ur10_data.main([str(tmp_path), "--from", str(ur10_folder.parent)])
     written = read(tmp_path / "ipa_ur10", json.loads((tmp_path / "ipa_ur10" / "dataset.json").read_text()))
     assert len(written.measurements) == 632
-    published = read(Path(given) / "ipa_ur10", find(Path(given), ["ipa_ur10"])["ipa_ur10"])
+    published = read(ur10_folder, find(ur10_folder.parent, ["ipa_ur10"])["ipa_ur10"])
     q = written.measurements.q[:5]
     apart = written.robot(q)[:, :3, 3].norm(dim=1) - published.robot(q)[:, :3, 3].norm(dim=1)
     assert float(apart.abs().max()) < 1e-6
