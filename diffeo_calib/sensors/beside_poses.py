@@ -29,18 +29,15 @@ class Trackers(Devices):
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn of B, and a shift of the marker."""
         return [PLACES.found_m_rad] * 9
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
-        """Coordinates of the marker."""
         B, marker = constants[:12].view(3, 4), constants[12:]
         return B[:, :3] @ (body[:3, :3] @ marker + body[:3, 3]) + B[:, 3]
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        """Shifted and turned."""
         B, marker = constants[:12].view(3, 4), constants[12:]
         whole = twist_transform(increments[:6]) @ transforms(B[:, :3], B[:, 3])
         return torch.cat([whole[:3].flatten(), marker + increments[6:]])
@@ -52,7 +49,6 @@ class Trackers(Devices):
         return torch.cat([found.base[:3].flatten(), found.tool[0]])
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Its marker, and that it holds lengths."""
         marker, std = 1e3 * self.constants[number, 12:], 1e3 * deviations[6:]
         place = f"{numbers_text(marker.tolist())} +- {numbers_text(std.tolist())} mm in the measured frame"
         return f"marker of '{self.names[number]}': {place}; lengths are its own and the board's"
@@ -68,28 +64,23 @@ class Contacts(Devices):
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of two shifts."""
         return [PLACES.found_m_rad] * 6
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
-        """How far the ball is from the socket."""
         return body[:3, :3] @ constants[3:] + body[:3, 3] - constants[:3]
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        """Shifted."""
         return constants + increments
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
-        """Linear in both."""
         eye = torch.eye(3, dtype=values.dtype, device=values.device).expand(len(bodies), 3, 3)
         columns = torch.cat([eye, -bodies[:, :3, :3]], 2).flatten(0, 1)
         return least_squares(columns, (bodies[:, :3, 3] - values).flatten())
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Socket and ball."""
         place, ball = (numbers_text((1e3 * part).tolist()) for part in self.constants[number].split(3))
         std = 1e3 * float(deviations[:3].norm())
         what = f"socket '{self.names[number]}': {place} +- {std:.3f} mm in {frame}"

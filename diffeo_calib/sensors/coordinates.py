@@ -142,7 +142,6 @@ class Positions(Sensor):
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
-        """Distances, and angles of poses."""
         names, data = data.device_names, places.aligned(data)
         points = points[:, :-1] if places.ball and points.shape[1] == data.markers + 1 else points
         check_same_markers(points, data.points)
@@ -173,7 +172,6 @@ class Poses(Positions):
     options, fix = ", `convention` and `rotation_angle`", "leave the rotation out"
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
-        """As they are."""
         return data
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
@@ -191,12 +189,10 @@ class Contacts(Sensor):
     """A ball in sockets, perhaps beside measured positions."""
 
     def check(self, data: Measurements, model: Any) -> None:
-        """A ball in sockets is not what a tracker saw."""
         check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
         check_tips(data, model.on[-data.markers :])
 
     def rare(self, data: Measurements) -> list[str]:
-        """Sockets with one row."""
         return rare_names(data.row_sockets, data.line_numbers.tolist(), 2)
 
     def check_angles(self, data: Measurements, model: Any) -> None:
@@ -220,7 +216,6 @@ class Contacts(Sensor):
                 raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
-        """With hidden markers before the ball."""
         self.check(data, model)
         return data.with_markers(model.markers)
 
@@ -269,11 +264,9 @@ class OtherDevices(Sensor):
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def with_points(self, data: Readings, model: Any) -> Readings:
-        """As they are."""
         return data
 
     def place(self, data: Readings, beside: Beside) -> Places:
-        """Devices that are not known."""
         known = beside.devices.get(data.kind)
         if known is not None and set(data.names) <= set(known.names):
             return Places(devices={data.column_kind: known})
@@ -290,7 +283,6 @@ class OtherDevices(Sensor):
         return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=numbers)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
-        """In the unit of the device."""
         devices = places.devices.get(data.column_kind)
         if devices is None:
             fix = "pass rows of the devices of the calibration"

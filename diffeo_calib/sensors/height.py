@@ -51,12 +51,10 @@ class Planes(Devices):
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of two turns and a shift."""
         return [PLACES.found_m_rad] * 3
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
-        """Of gauges."""
         return {"height": ("height", "gauge", "dial", "dial_gauge", "indicator")}
 
     @classmethod
@@ -73,7 +71,6 @@ class Planes(Devices):
         return torch.cat([normal, (points @ normal - values).mean()[None]])
 
     def observation(self, device: Tensor) -> LinearFunctionals:
-        """Heights."""
         own = self.constants[device]
         return LinearFunctionals(own[:, None, :3], own[:, 3:])
 
@@ -84,11 +81,9 @@ class Planes(Devices):
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
 
     def where(self, number: int) -> str:
-        """The normal."""
         return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Normal and distance."""
         *normal, distance = self.constants[number].tolist()
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
         what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
@@ -96,7 +91,6 @@ class Planes(Devices):
 
     @classmethod
     def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The linear equations above."""
         values, one = data.values[:, 0], torch.ones_like(data.values)
         others = torch.cat([R.flatten(1), -one], 1)  # their unknowns follow from the normal
         basis = torch.linalg.svd(others, full_matrices=False)

@@ -32,7 +32,6 @@ class HeldTools(Devices):
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn."""
         return [PLACES.found_m_rad] * 6
 
     @staticmethod
@@ -63,7 +62,6 @@ class HeldTools(Devices):
         return torch.cat([R, shift], 1).flatten()
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Where it has the second hand."""
         place = (1e3 * self.constants[number].view(3, 4)[:, 3]).tolist()
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
         what = f"held tool '{self.names[number]}': the second hand at {numbers_text(place)} +- {shift:.3f} mm"

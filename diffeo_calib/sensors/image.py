@@ -33,7 +33,6 @@ class Cameras(Devices):
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn."""
         return [PLACES.found_m_rad] * 6
 
     @classmethod
@@ -54,7 +53,6 @@ class Cameras(Devices):
         return torch.cat([torch.cat([R, t], 2).flatten(1), depth], 1)
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
-        """Whether points are in the field of view."""
         own = self.poses[device]
         seen = (own[:, :3, :3] @ points[:, :, None])[..., 0] + own[:, :3, 3]
         return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
@@ -73,7 +71,6 @@ class Cameras(Devices):
 
     @property
     def metres(self) -> Tensor:
-        """The mean depth of the ball."""
         return self.constants[:, 12]
 
     @property
@@ -108,12 +105,10 @@ class Cameras(Devices):
                 yield Hypothesis(words, own, ("%", 1e-2), fix, said=True)
 
     def where(self, number: int) -> str:
-        """The place."""
         pose = self.poses[number]
         return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Place and direction of view."""
         pose = self.poses[number]
         place = (-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist()
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())

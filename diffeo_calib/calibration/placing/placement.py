@@ -196,14 +196,12 @@ class Placement(tuple[DeviceSet, ...]):
         return {name: view for own in self for name, view in own.views().items()}
 
     def measured_at(self, row: int, like: T, points: Tensor) -> T:
-        """See :meth:`DeviceSet.measured_at`."""
         views = self.views()
         for own in self:
             like = own.measured_at(row, like, points, views)
         return like
 
     def places_at(self, row: int) -> Tensor | None:
-        """See :meth:`DeviceSet.places_at`."""
         return next((places for own in self if (places := own.places_at(row)) is not None), None)
 
     def shared(self, data: Seen) -> Tensor | None:

@@ -70,7 +70,6 @@ class ReadingDevices(DeviceSet):
 
     @property
     def size(self) -> int:
-        """Increments of all devices."""
         return self.devices.freedom
 
     @property
@@ -83,28 +82,24 @@ class ReadingDevices(DeviceSet):
         return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`."""
         own = self.devices.shared(self._seen(data), self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
         found[self.rows[:, None], self.numbers] = own
         return found
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
-        """See :class:`DeviceSet`: those of the devices, with effects on all rows."""
         for one in self.devices.hypotheses(self._seen(data), self.device):
             whole = one.effects.new_zeros(*data.y.shape, one.effects.shape[2])
             whole[self.rows[:, None], self.numbers] = one.effects
             yield one._replace(effects=whole)
 
     def settled(self, found: Settled) -> ReadingDevices:
-        """See :class:`DeviceSet`."""
         devices, shape = self.devices, (len(self.devices.names), -1)
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
         known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
         return replace(self, devices=moved, known=known)
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
-        """See :class:`DeviceSet`."""
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
         self.devices.numbers(own.table)  # refuses other devices
         return replace(self, data=own.table, rows=own.rows)
@@ -116,19 +111,16 @@ class ReadingDevices(DeviceSet):
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:
-        """See :class:`DeviceSet`."""
         known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         prior = self.devices.deviations.expand(len(self.devices.names), -1)
         deviations = prior if self.known is None else self.known
         own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
         return PlacedDevices(self.devices.kind, *own, self.data.shown)
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`."""
         constants = dict(zip(self.devices.names, self.devices.constants.tolist(), strict=True))
         found: dict[str, object] = {"constants": constants}
         if self.known is not None:

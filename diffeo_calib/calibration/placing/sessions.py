@@ -130,7 +130,6 @@ class Sessions(DeviceSet):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the sessions."""
         return self.set_ups.names
 
     @property
@@ -144,7 +143,6 @@ class Sessions(DeviceSet):
         return self.set_ups.aligned(data)
 
     def groups(self) -> list[tuple[str, Tensor]]:
-        """See :class:`DeviceSet`."""
         return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
 
     @property
@@ -173,25 +171,21 @@ class Sessions(DeviceSet):
         return len(self.others) * self.set_ups.increments_each
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`: what is left of the differences."""
         tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
         by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         return self.of_each(self.set_ups.increments(places, data.slopes, by_tool, centre), self.session)
 
     def settled(self, found: Settled) -> Sessions:
-        """See :class:`DeviceSet`."""
         steps, k = found.shifts.view(len(self.others), -1), self.set_ups.deviations.shape[1]
         std = found.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
         moved = self.set_ups.moved(self.others, steps, std, found.centre, found.transform)
         return replace(self, set_ups=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        """See :class:`DeviceSet`."""
         return dict(zip(self.names, self.set_ups.views(), strict=True))
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
-        """See :class:`DeviceSet`."""
         session, points, count = self.session[own.rows], own.table.points, self.markers
         for number, name in enumerate(self.names if self.set_ups.kind == SESSION else ()):
             T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
@@ -200,20 +194,16 @@ class Sessions(DeviceSet):
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         rows, own = (self.session != NO_SOCKET).nonzero()[:, 0], self.set_ups
         return PlacedDevices(own.kind, own.names, own.constants, own.deviations, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`."""
         return {self.set_ups.key: self.set_ups.entry()}
 
     def sentences(self) -> list[str]:
-        """See :class:`DeviceSet`."""
         return self.set_ups.sentences()
 
     def with_rows(self, other: OtherRows) -> Sessions:
-        """See :class:`DeviceSet`."""
         session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
         device = None if other.coordinates is None else measured_rows(other.coordinates.table)
         if other.coordinates is not None and device is not None:

@@ -161,25 +161,22 @@ class SocketDevices(DeviceSet):
         return effects
 
     def at_places(self, table: Measurements) -> Measurements:
-        """See :class:`DeviceSet`: the places of their sockets as measured positions of the ball."""
+        """The places of their sockets as measured positions of the ball."""
         table = self.named(table)
         rows, points = table.socket_numbers != NO_SOCKET, table.points.clone()
         points[rows, -1] = self.positions[table.socket_numbers[rows]]
         return with_attributes(table, points=points)
 
     def places_at(self, row: int) -> Tensor | None:
-        """See :class:`DeviceSet`: all sockets."""
         return None if self.socket[row] == NO_SOCKET else self.positions
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """See :class:`DeviceSet`: whether the ball is near a socket."""
         places = self.places_at(row)
         if places is None:
             return super().sees(row, points, views)
         return torch.cdist(points[:, -1], places.to(points)).amin(1) < IN_SOCKET_M
 
     def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """See :class:`DeviceSet`: in the nearest socket."""
         places = self.places_at(row)
         if places is None:
             return like
@@ -188,16 +185,13 @@ class SocketDevices(DeviceSet):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """S names."""
         return self.sockets.names
 
     @property
     def size(self) -> int:
-        """Three of each socket."""
         return self.root.shape[1]
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
-        """See :class:`DeviceSet`: the known distances, the same at all places."""
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.sockets.blocks:
             effects = data.points.new_zeros(*data.points.shape, 1)
@@ -215,12 +209,10 @@ class SocketDevices(DeviceSet):
             )
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`: the errors of the last marker, the ball."""
         effects = self.shared(data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
 
     def settled(self, found: Settled) -> SocketDevices:
-        """See :class:`DeviceSet`."""
         root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
@@ -234,7 +226,6 @@ class SocketDevices(DeviceSet):
         )
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
-        """See :class:`DeviceSet`."""
         socket = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
         if other.coordinates is not None:
             table = self.named(other.coordinates.table)
@@ -289,7 +280,6 @@ class SocketDevices(DeviceSet):
         return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
         return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
 
