@@ -154,10 +154,6 @@ class Devices(ABC):
         """
         return None
 
-    @classmethod  # noqa: B027
-    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
-        """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
-
     @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
         """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""

@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import few
 from diffeo_calib.maps.observation import LinearFunctionals
-from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
@@ -28,13 +27,10 @@ from diffeo_calib.sensors.devices import (
     unit_least_squares,
 )
 
-LARGEST_UNEXPLAINED, FEWEST_SPARE_ROWS = 1e-2, 5
-"""Share of the heights' variance, and rows of a plane beyond its unknowns, that say something about their unit."""
 LEAST_SHARE = 1e-4
 """Directions of the unknowns that data determine less than this, relative to the best one, are left at zero."""
-UNIT_RATIO, OTHER_UNIT, CORRELATED = 10.0, 0.5, 0.5
-"""Factor between measured and found heights that is doubted, its relative error from which it is no unit's, and their
-correlation that shows it."""
+UNIT_RATIO, CORRELATED = 10.0, 0.5
+"""Factor between measured and found heights that is doubted, and their correlation that shows it."""
 FLAT_SHARE = 0.2
 """Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
 PARALLEL_SINE = 0.1
@@ -101,20 +97,16 @@ class Planes(Devices):
         return found[:9].view(3, 3).mT @ n, torch.cat([n, found[9:]])
 
     @classmethod
-    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
-        """Heights per height that the tip's poses explain."""
-        factor = height_factor(data, R, t)
-        if factor > UNIT_RATIO:
-            what = f"the heights are about {factor:.3g} times larger than the robot moves along the planes' normals"
-            text = sentence(what, fix="check the unit of the heights (mm or m)")
-            if in_other_unit(factor, OTHER_UNIT):
-                raise MeasurementError(text)
-            warn_user(text)
-
-    @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
-        """By how much the ball's heights change per change of the measured ones."""
-        return not 1 / UNIT_RATIO < _factor(data, errors) < UNIT_RATIO
+        """By how much the ball's heights change per change of the measured ones, where they change together."""
+        measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
+        whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
+        mean = whose / whose.sum(0)
+        measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
+        together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
+        if together < CORRELATED * size or size == 0.0:
+            return False
+        return not 1 / UNIT_RATIO < together / float(measured.square().sum()) < UNIT_RATIO
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """Directions that no plane faces."""
@@ -130,35 +122,3 @@ class Planes(Devices):
             parallel = f" ({few(alike)} are parallel)" * bool(alike)
             what = f"no plane faces some directions{parallel}: errors of the ball along them are not measured"
             yield what, "add planes in other directions, best three at right angles"
-
-
-def height_factor(data: Readings, R: Tensor, t: Tensor) -> float:
-    """Measured heights per height that the tip's poses explain, the largest of the planes; 1 where they explain none.
-
-    Args:
-        data: heights. R: (N, 3, 3), t: (N, 3), the tip's poses in the base, m.
-    """
-    factors = [1.0]
-    for number in range(len(data.names)):
-        own = data.device == number
-        matrix, heights = torch.cat([t, R.flatten(1), -torch.ones_like(t[:, :1])], 1)[own], data.values[own, 0]
-        spare = len(heights) - matrix.shape[1]
-        if spare < FEWEST_SPARE_ROWS or not bool(heights.any()):
-            continue
-        found = least_squares(matrix, heights)
-        unexplained = (heights - matrix @ found).square().sum() / spare
-        if float(unexplained) < LARGEST_UNEXPLAINED * float(heights.var()):
-            factors.append(float(found[:3].norm()))
-    return max(factors)
-
-
-def _factor(data: Readings, errors: Tensor) -> float:
-    """By how much the ball's heights change per change of the measured ones; 1 if they hardly change together."""
-    measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
-    whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
-    mean = whose / whose.sum(0)
-    measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
-    together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
-    if together < CORRELATED * size or size == 0.0:
-        return 1.0
-    return together / float(measured @ measured)

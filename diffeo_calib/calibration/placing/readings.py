@@ -161,8 +161,6 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     held, joints = held_parameters(bare), range(bare.size)[bare.slices["joints"]]
     root, still = Prior().root(bare, held), Prior().root(bare, [*held, *joints])
     poses = [bare.marker_poses(data.q) for data in tables]
-    for data, T in zip(tables, poses, strict=True):
-        kind_of(data).check_unit(data, T[:, 0, :3, :3], T[:, 0, :3, 3])
     found = _rough_fits(bare, still, _starts(bare.tool[0], tables, poses), poses)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
