@@ -18,6 +18,7 @@ from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
@@ -220,8 +221,7 @@ class Devices(ABC):
         if data.kind != self.kind or not set(data.names) <= set(self.names):
             expected, got = f"{self.kind}s of {few(self.names)}", f"{data.kind}s of {few(data.names)}"
             raise MeasurementError.of("`data`", expected=expected, got=got, fix="pass rows of the same devices")
-        own = [self.names.index(name) for name in data.names]
-        return torch.tensor(own, dtype=torch.int64, device=data.device.device)[data.device]
+        return numbers_of(data.names, self.names).to(data.device.device)[data.device]
 
     def errors(self, data: Readings, points: Tensor) -> Tensor:
         """Measured minus predicted readings (N, r), m, of the ball at points (N, 3), m."""

@@ -18,6 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import largest_known
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.pose_frames import frames_of_points
 from diffeo_calib.measurements.poses import poses_from_marks, poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
@@ -191,8 +192,7 @@ class SetUps(ABC):
 
     def of_rows(self, data: Measurements) -> Tensor:
         """(N, c) the constants of every row."""
-        known = [*("" if name == ROWS else name for name in self.names), ""]
-        whose = torch.tensor([known.index(name) for name in data.device_names], dtype=torch.int64, device=HOST)
+        whose = numbers_of(data.device_names, ["" if name == ROWS else name for name in self.names])
         return torch.cat([self.constants, self.same[None]])[whose].to(data.points)
 
 

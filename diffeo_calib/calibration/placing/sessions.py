@@ -24,6 +24,7 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -219,8 +220,7 @@ class Sessions(DeviceSet):
         if unknown:
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        known = [self.names.index(name) if name else NO_SOCKET for name in names]
-        return torch.tensor(known, dtype=torch.int64, device=HOST)
+        return numbers_of(names, self.names)
 
     def of_rows(self, rows: Tensor, count: int) -> Sessions:
         """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""

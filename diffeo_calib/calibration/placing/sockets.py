@@ -40,6 +40,7 @@ from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_use
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
@@ -237,9 +238,7 @@ class SocketDevices(DeviceSet):
         unknown = sorted(set(table.row_sockets) - {*self.names, ""})
         if unknown:
             raise MeasurementError.of("rows in sockets", expected=few(self.names), got=few(unknown))
-        numbers = {name: number for number, name in enumerate(self.names)} | {"": NO_SOCKET}
-        own = torch.tensor([numbers[name] for name in table.row_sockets], dtype=torch.int64, device=HOST)
-        return with_attributes(table, socket=own, sockets=self.sockets)
+        return with_attributes(table, socket=numbers_of(table.row_sockets, self.names), sockets=self.sockets)
 
     def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
         """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.
