@@ -175,7 +175,9 @@ class Poses(Positions):
         return data
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
-        measured = whole_frames(data)
+        if data.frames is None:
+            raise InputError.of("measured poses", got=f"{data.kind}s")
+        measured = data.frames
         frames = frames_of_points(points, data.bodies.pose_lever())
         away = measured[..., :3, 3] - frames[..., :3, 3]
         angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
@@ -259,7 +261,9 @@ class OtherDevices(Sensor):
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
             model.bodies.pose_lever()
-            check_frames(data, model)
+            needed, known = (points // model.bodies.points for points in (kind_of(data).seen_points, model.markers))
+            if needed > known:
+                raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
@@ -374,13 +378,6 @@ def check_ball(model: Any, what: str, of: str, needed: str) -> None:
         raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
 
 
-def check_frames(data: Readings, model: Any) -> None:
-    """Raise InputError for readings of more frames than a model has."""
-    needed, known = kind_of(data).seen_points // model.bodies.points, model.markers // model.bodies.points
-    if needed > known:
-        raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
-
-
 def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
     """Raise MeasurementError if the measurements say that their points are on other tips than these of a model.
 
@@ -446,10 +443,3 @@ def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:
     if data.socket is None or data.sockets is None:
         raise InputError.of("rows in sockets", got=f"{data.kind}s")
     return data.socket.to(data.points.device), data.sockets
-
-
-def whole_frames(data: Measurements) -> Tensor:
-    """(N, T, 4, 4) measured poses; InputError for rows without."""
-    if data.frames is None:
-        raise InputError.of("measured poses", got=f"{data.kind}s")
-    return data.frames

@@ -34,24 +34,6 @@ def shown_unit(unit: str) -> tuple[str, float]:
     return ("mm", 1e3) if unit == "m" else (unit, 1.0)
 
 
-def errors_frame(errors: Any) -> Any:
-    """The errors of every row and marker as a pandas.DataFrame.
-
-    Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
-    and y of images) and error in the unit of the evaluation, and angle in rad for poses.
-
-    Raises:
-        ImportError: pandas is not installed.
-    """
-    N, P = errors.errors.shape
-    rows = torch.arange(N, device=HOST) if errors.line_numbers is None else errors.line_numbers
-    columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
-    if errors.away is not None:
-        columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=False))
-    columns["error"] = errors.errors.flatten()
-    return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles.flatten()})
-
-
 @dataclass(frozen=True)
 class DistanceError:
     """A known distance between two sockets, and the distance between the middles of predicted positions.
@@ -143,7 +125,22 @@ class Evaluation:
         rows = torch.arange(len(self.errors), device=HOST)[chosen.cpu()].tolist()
         return replace(self, **some, devices=[self.devices[row] for row in rows] if self.devices else (), distances=())
 
-    to_frame = errors_frame
+    def to_frame(self) -> Any:
+        """The errors of every row and marker as a pandas.DataFrame.
+
+        Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
+        and y of images) and error in the unit of the evaluation, and angle in rad for poses.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        N, P = self.errors.shape
+        rows = torch.arange(N, device=HOST) if self.line_numbers is None else self.line_numbers
+        columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
+        if self.away is not None:
+            columns |= dict(zip("xyz", self.away.flatten(0, 1).T, strict=False))
+        columns["error"] = self.errors.flatten()
+        return data_frame(columns if self.angles is None else columns | {"angle": self.angles.flatten()})
 
     @property
     def title(self) -> str:

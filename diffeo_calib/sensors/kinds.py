@@ -23,8 +23,6 @@ KINDS: dict[str, type[Devices]] = {
     kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)
 }
 
-GROUP = "diffeo_calib.sensors"
-
 
 def register(kind: type[Devices]) -> type[Devices]:
     """Make a kind of device known, a concrete subclass of :class:`Devices`; can decorate its class.
@@ -43,14 +41,10 @@ def register(kind: type[Devices]) -> type[Devices]:
 
 
 @cache
-def _load_installed() -> None:
-    for found in entry_points(group=GROUP):
-        found.load()
-
-
 def known_kinds() -> dict[str, type[Devices]]:
     """All kinds by their names, those of installed packages too."""
-    _load_installed()
+    for found in entry_points(group="diffeo_calib.sensors"):
+        found.load()
     return KINDS
 
 

@@ -20,7 +20,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.pose_frames import frames_of_points
-from diffeo_calib.measurements.poses import poses_from_marks, poses_of_triangles
+from diffeo_calib.measurements.poses import angle_between, poses_from_marks, poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
@@ -406,7 +406,7 @@ def _turned(turns: Turns | None, data: Measurements) -> Tensor:
 def _size(constants: Tensor) -> tuple[float, float]:
     """Shift, m, and turn, rad, of a transform (16,)."""
     T = constants.view(4, 4)
-    return float(T[:3, 3].norm()), float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+    return float(T[:3, 3].norm()), float(angle_between(torch.eye(3, dtype=T.dtype, device=T.device), T[:3, :3]))
 
 
 def _middle(away: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
+from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
@@ -83,8 +83,8 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
     kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
     first, modes = 0, None
     if own is not None:
-        rows, m = own.rows, own.y.shape[1]
-        parts.append(coordinates_of(rows, m, q))
+        rows = own.rows
+        parts.append(Part.of_coordinates(rows, own.y.shape[1]))
         y[rows], visible[rows] = own.y, own.noise_model.coordinates(own.y)
         if own.noise_model.known is not None:
             known[rows] = own.noise_model.known
@@ -115,12 +115,6 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
         kinds=kinds if int(kinds.max()) else None,
     )
     return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
-
-
-def coordinates_of(rows: Tensor, m: int, like: Tensor) -> Part:
-    """Rows (M,) that report the first m coordinates as their first m numbers."""
-    eye, whole = torch.eye(m, dtype=like.dtype, device=like.device), torch.arange(m, device=like.device)
-    return Part(rows, whole, whole, LinearFunctionals(eye.expand(len(rows), m, m), like.new_zeros(len(rows), m)))
 
 
 LOG = logging.getLogger(__name__)
@@ -309,7 +303,8 @@ class Placed:
         noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
         seen, predicted = table.points.flatten(1), nominal(table.q, theta)
         y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
-        return TangentData(nominal, theta, table.q, y, noise, noise.body_tails(found.tails))
+        worst = found.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point
+        return TangentData(nominal, theta, table.q, y, noise, replace(found.tails, weights=worst))
 
     def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
         """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""

@@ -184,14 +184,22 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
 def _rough_fits(
     bare: Geometry, root: Tensor, starts: Sequence[tuple[Tensor, list[ReadRows]]], poses: Sequence[Tensor]
 ) -> list[tuple[tuple[float, str], Fit, Rows]]:
-    """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
+    """Ball and devices from each start that leads anywhere, after the largest median residual of a device and its name.
+
+    One wrong plane of three shows in it, m.
+    """
     found = []
     for ball, parts in starts:
         rows = Rows(bare.with_tool(ball[None]), tuple(parts), poses)
         sigma = ball.new_full((sum(len(own.q) for own in parts), 1), ROUGH_M)
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             rough = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
-            found.append((_of_worst_device(parts, rough.errors), rough, rows))
+            worst = max(
+                (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
+                for (data, _), own in zip(parts, rough.errors, strict=True)
+                for number, name in enumerate(data.names)
+            )
+            found.append((worst, rough, rows))
     return found
 
 
@@ -295,15 +303,6 @@ def _moved(rows: Rows, shifts: Tensor) -> tuple[ReadRows, ...]:
     """All rows with their devices after shifts."""
     each = zip(rows.parts, rows.split(shifts), strict=True)
     return tuple(own._replace(devices=own.moved(some)) for own, some in each if isinstance(own, ReadRows))
-
-
-def _of_worst_device(parts: Sequence[ReadRows], errors: Sequence[Tensor]) -> tuple[float, str]:
-    """The largest median residual of a device's readings, m, and its name: one wrong plane of three shows in it."""
-    return max(
-        (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
-        for (data, _), own in zip(parts, errors, strict=True)
-        for number, name in enumerate(data.names)
-    )
 
 
 def _doubt(
