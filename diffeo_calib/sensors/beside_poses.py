@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.placement import PLACES, place
+from diffeo_calib.robots.placement import place
 from diffeo_calib.robots.se3 import transforms, twist_transform
 from diffeo_calib.sensors.devices import Devices, least_squares, numbers_text
 
@@ -25,11 +25,7 @@ class Trackers(Devices):
 
     kind = "marker"
     size_fix = "measure longer moves"
-    seen_points, numbers_each = 3, 3
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 9
+    seen_points, numbers_each, increments_each = 3, 3, 9
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
@@ -60,11 +56,7 @@ class Contacts(Devices):
 
     kind = "contact"
     size_fix = "measure poses too: contacts hold no lengths"
-    seen_points, numbers_each = 3, 3
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 6
+    seen_points, numbers_each, increments_each = 3, 3, 6
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:

@@ -206,7 +206,7 @@ class Contacts(Sensor):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data)).away.norm(dim=1)
+            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data))[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
@@ -232,10 +232,9 @@ class Contacts(Sensor):
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        found = socket_errors(points[:, -1], *sockets_of(data))
-        size, away, lines = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.line_numbers
-        names = data.row_sockets
-        return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
+        away, distances = socket_errors(points[:, -1], *sockets_of(data))
+        size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
+        return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> None:
         """None: a ball in a socket is where the robot brought it."""

@@ -24,6 +24,7 @@ from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
+from diffeo_calib.robots.placement import PLACES
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -70,6 +71,8 @@ class Devices(ABC):
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
     """Points of the tool that it sees: the ball, or three of each measured frame."""
+    increments_each: ClassVar[int]
+    """Increments k of a device."""
     numbers_each: ClassVar[int] = 1
     """Numbers r of a reading."""
     metres_each: ClassVar[float] = 1.0
@@ -87,9 +90,9 @@ class Devices(ABC):
         """Constants (c,) of one device in closed form, from readings (N, r) of known bodies, see :meth:`bodies`."""
 
     @classmethod
-    @abstractmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
+        """Standard deviations of the k increments, m or rad, wide by default; ``offset_std``: see :class:`Readings`."""
+        return [PLACES.found_m_rad] * cls.increments_each
 
     @classmethod
     def columns(cls) -> Mapping[str, Sequence[str]]:

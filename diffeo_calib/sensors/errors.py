@@ -53,22 +53,13 @@ class DistanceError:
         return self.found - self.known
 
 
-@dataclass(frozen=True, eq=False)
-class SocketErrors:
-    """Spread and distances of predicted positions.
+def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[Tensor, tuple[DistanceError, ...]]:
+    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean.
 
-    Args:
-        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a
-            row that is alone in its socket, whose middle it is.
-        distances: those whose sockets both have rows.
+    Returns:
+        (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a row
+        that is alone in its socket, whose middle it is. Known distances between sockets that both have rows.
     """
-
-    away: Tensor
-    distances: tuple[DistanceError, ...]
-
-
-def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> SocketErrors:
-    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean."""
     inside = socket != NO_SOCKET
     own = socket[inside]
     count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
@@ -80,8 +71,7 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> Socket
         if seen[a] and seen[b]
     )
     judged = inside & (count > 1)[socket]
-    away = (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan)
-    return SocketErrors(away, distances)
+    return (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan), distances
 
 
 @dataclass(frozen=True, repr=False)

@@ -18,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.common.errors import few
 from diffeo_calib.maps.observation import LinearFunctionals
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
     Devices,
     across,
@@ -43,11 +42,8 @@ class Planes(Devices):
 
     kind = "height"
     stated_as = "NX,NY,NZ,D"
+    increments_each = 3
     size_fix = "touch a gauge block of known height on the same planes too and give its height"
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 3
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import Devices, numbers_text
 
@@ -28,11 +27,7 @@ class HeldTools(Devices):
 
     kind = "held tool"
     size_fix = "measure poses too: a held tool holds no lengths"
-    seen_points, numbers_each = 2 * POINTS, 6
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 6
+    seen_points, numbers_each, increments_each = 2 * POINTS, 6, 6
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,
@@ -29,11 +28,8 @@ class Cameras(Devices):
 
     kind = "image"
     stated_as = "X,Y,Z,TX,TY,TZ"
+    increments_each = 6
     size_fix = "trust angles and shapes only, or measure distances, which hold lengths"
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 6
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:

@@ -18,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, Hypothesis, least_squares, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
@@ -36,11 +35,12 @@ class FixedPoints(Devices):
 
     kind = "distance"
     stated_as = "X,Y,Z"
+    increments_each = 4
     size_fix = "measure longer and more different distances, or with a known zero"
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        return [PLACES.found_m_rad] * 3 + [offset_std or FIXED_DEVIATION_M]
+        return [*super().prior()[:3], offset_std or FIXED_DEVIATION_M]
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:

@@ -209,11 +209,14 @@ class Placement(tuple[DeviceSet, ...]):
         effects = [own.effects(data) for own in self]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(self, fitted: Fit, around: FittedMap, *at: Tensor, kind: Any = DeviceSet, **known: Any) -> Placement:
+    def settled(
+        self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, kind: Any = DeviceSet, **known: Any
+    ) -> Placement:
         """Those of a kind where a fit puts them, whose last shifts are those of all devices.
 
         Args:
-            fitted: the fit. around: its map, with the covariances of the model. at, known: see :class:`Settled`.
+            fitted: the fit. around: its map, with the covariances of the model.
+            centre, transform, known: see :class:`Settled`.
         """
         sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.size for own in self]
         whole = around.shift_covariance() if len(shifts) else shifts[:, None]
@@ -221,7 +224,7 @@ class Placement(tuple[DeviceSet, ...]):
         for own, part in zip(self, numbers.split(sizes), strict=True):
             if isinstance(own, kind):
                 covariance = whole[part[:, None], part]
-                sets.append(own.settled(Settled(shifts[part], covariance, around, *at, **known)))
+                sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)
 
     def aligned(self, data: T) -> T:

@@ -81,17 +81,18 @@ class ReadingDevices(DeviceSet):
         """(M, 3 k) coordinates of what the devices see, m."""
         return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
 
-    def effects(self, data: Seen) -> Tensor:
-        own = self.devices.shared(self._seen(data), self.device)
-        found = own.new_zeros(*data.y.shape, own.shape[2])
-        found[self.rows[:, None], self.numbers] = own
+    def _of_all_rows(self, effects: Tensor, data: Seen) -> Tensor:
+        """Effects (M, r, U) on the own rows as those on all (N, R, U)."""
+        found = effects.new_zeros(*data.y.shape, effects.shape[2])
+        found[self.rows[:, None], self.numbers] = effects
         return found
+
+    def effects(self, data: Seen) -> Tensor:
+        return self._of_all_rows(self.devices.shared(self._seen(data), self.device), data)
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         for one in self.devices.hypotheses(self._seen(data), self.device):
-            whole = one.effects.new_zeros(*data.y.shape, one.effects.shape[2])
-            whole[self.rows[:, None], self.numbers] = one.effects
-            yield one._replace(effects=whole)
+            yield one._replace(effects=self._of_all_rows(one.effects, data))
 
     def settled(self, found: Settled) -> ReadingDevices:
         devices, shape = self.devices, (len(self.devices.names), -1)

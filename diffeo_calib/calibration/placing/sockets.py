@@ -257,7 +257,9 @@ class SocketDevices(DeviceSet):
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
             predicted = data.y[rows, -3:] - errors.view(-1, 3)
-            found.append(PlaceErrors(name, len(rows), *_spread(predicted, self.socket[rows], sockets)))
+            away, distances = socket_errors(predicted, self.socket[rows], sockets)
+            spread = float(away.square().sum(1).mean().sqrt())
+            found.append(PlaceErrors(name, len(rows), spread, tuple(one.error for one in distances)))
         return tuple(found)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
@@ -303,12 +305,6 @@ class SocketDevices(DeviceSet):
             known = f", distance {errors} mm" * bool(errors)
             lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
-
-
-def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float, tuple[float, ...]]:
-    """Spread of predicted positions (N, 3) within sockets, and errors of the known distances, m."""
-    errors = socket_errors(predicted, socket, sockets)
-    return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
 
 
 def coordinate_stages(
