@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.robots.placement import place
-from diffeo_calib.robots.se3 import transforms, twist_transform
-from diffeo_calib.sensors.devices import Devices, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose, numbers_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +33,7 @@ class Trackers(Devices):
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        B, marker = constants[:12].view(3, 4), constants[12:]
-        whole = twist_transform(increments[:6]) @ transforms(B[:, :3], B[:, 3])
-        return torch.cat([whole[:3].flatten(), marker + increments[6:]])
+        return torch.cat([moved_pose(constants[:12], increments[:6]), constants[12:] + increments[6:]])
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import transforms, twist_transform
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -353,6 +354,12 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
     x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
     return vectors @ (x / x.norm())
+
+
+def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:
+    """The rows (..., 12) of a transform after a shift and a turn (..., 6) in the frame that it leads to, m and rad."""
+    T = rows.unflatten(-1, (3, 4))
+    return (twist_transform(twist) @ transforms(T[..., :3], T[..., 3]))[..., :3, :].flatten(-2)
 
 
 def numbers_text(values: list[float]) -> str:

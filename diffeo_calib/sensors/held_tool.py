@@ -17,8 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
-from diffeo_calib.sensors.devices import Devices, numbers_text
+from diffeo_calib.robots.se3 import nearest_rotations
+from diffeo_calib.sensors.devices import Devices, moved_pose, numbers_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +44,7 @@ class HeldTools(Devices):
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
         """Shifted and turned in the first hand's frame."""
-        held = constants.view(3, 4)
-        whole = twist_transform(increments) @ transforms(held[:, :3], held[:, 3])
-        return whole[:3].flatten()
+        return moved_pose(constants, increments)
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:

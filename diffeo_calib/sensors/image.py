@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
+from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,
     Devices,
     Hypothesis,
+    moved_pose,
     numbers_text,
 )
 
@@ -81,8 +82,8 @@ class Cameras(Devices):
 
     def moved(self, increments: Tensor) -> Devices:
         """Shifted and turned in the cameras' own frames."""
-        moved = twist_transform(increments) @ self.poses
-        return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
+        moved = moved_pose(self.constants[:, :12], increments)
+        return replace(self, constants=torch.cat([moved, self.constants[:, 12:]], 1))
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""

@@ -99,9 +99,7 @@ class Sessions(DeviceSet):
         geometry = register_inliers(robot, data.largest_session())[0].geometry
         found = cls.around(data, kind, geometry, geometry.points(data.q))
         for _ in range(ROUNDS - 1):  # a better geometry gives better places
-            together = found.aligned(data)
-            start = register(robot, together.q, together.points, marker_tips(robot, data))
-            geometry = identify(start.geometry, together.q, together.points).geometry
+            geometry = _geometry(robot, found.aligned(data))
             found = cls.around(data, kind, geometry, geometry.points(data.q))
         return found
 
@@ -243,10 +241,15 @@ def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:
             warn_user(sentence(words, fix=fix))
 
 
+def _geometry(robot: Tree, data: Measurements) -> Geometry:
+    """Geometric calibration by all rows."""
+    start = register(robot, data.q, data.points, marker_tips(robot, data))
+    return identify(start.geometry, data.q, data.points).geometry
+
+
 def _largest_median(robot: Tree, data: Measurements, sessions: Sessions) -> float:
     """Median distance of a session's rows from the geometric calibration of all, m: that of the worst session."""
-    points = sessions.aligned(data).points
-    start = register(robot, data.q, points, marker_tips(robot, data))
-    away = (identify(start.geometry, data.q, points).geometry.points(data.q) - points).norm(dim=2)
+    together = sessions.aligned(data)
+    away = (_geometry(robot, together).points(data.q) - together.points).norm(dim=2)
     numbers = sessions.numbers(data)
     return max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())

@@ -38,7 +38,6 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
-from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
@@ -54,7 +53,6 @@ from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -307,28 +305,6 @@ class SocketDevices(DeviceSet):
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
-def coordinate_stages(
-    robot: Tree, own: Coordinates, count: int, progress: Progress
-) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
-    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
-
-    Args:
-        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
-
-    Raises:
-        MeasurementError: rows that cannot belong to this robot, or too few.
-    """
-    progress("registration", 0, 1)
-    if own.table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, own.table)
-        return [places.of_rows(own.rows, count)], table, stages
-    registration = registered(robot, own.table)
-    progress("geometry", 0, 1)
-    identification = identify(registration.geometry, own.table.q, own.table.points)
-    check_identification(own.table, identification)
-    return [], own.table, (registration, identification)
-
-
 def stages_by_sockets(
     robot: Tree, data: Measurements
 ) -> tuple[SocketDevices, Measurements, tuple[Identification, Identification]]:
@@ -355,13 +331,19 @@ def stages_by_sockets(
         registration = start.with_ball(registration)
         tails = Tails.none(len(data), registration.geometry.markers, device=registration.theta.device)
         registration = replace(registration, tails=tails)
-    identification, places = geometry_by_sockets(data, found.positions, registration)
+    geometry, places = registration.geometry, SocketDevices.around(data, found.positions)
+    held = held_parameters(geometry) if start is None else ()
+    for _ in range(ROUNDS):
+        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
+        identification = identify(geometry, placed.q, placed.points, shared=shared, held=held)
+        ball = identification.geometry.points(resting.q)[:, -1]
+        places = SocketDevices.around(data, socket_means(ball, resting.socket_numbers))
     if device is not None and start is not None:
         seen = identification.geometry  # without the ball, which a device does not see
         seen = seen.with_tool(seen.tool[:-1], seen.on[:-1])
         check_identification(device, replace(identification, geometry=seen))
         warn_of_other_robot(robot, device, start, found)
-    warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
+    warn_of_wrong_sockets(resting, ball)
     return places, places.at_places(data), (registration, identification)
 
 
@@ -371,29 +353,6 @@ def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
         return None
     resting = data.with_sockets_of_rows().socket_rows()
     return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
-
-
-def _ball(geometry: Geometry, data: Measurements) -> Tensor:
-    """Places (N, 3) of the ball, m."""
-    return geometry.points(data.q)[:, -1]
-
-
-def geometry_by_sockets(
-    data: Measurements, positions: Tensor, registration: Identification
-) -> tuple[Identification, SocketDevices]:
-    """Geometric calibration, and the places of the sockets around it.
-
-    Args:
-        data: rows with sockets. positions: (S, 3) of the registration [m].
-    """
-    geometry, resting = registration.geometry, data.socket_rows()
-    held = held_parameters(geometry) if data.without_device else ()
-    places = SocketDevices.around(data, positions)
-    for _ in range(ROUNDS):
-        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
-        found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
-        places = SocketDevices.around(data, socket_means(_ball(found.geometry, resting), resting.socket_numbers))
-    return found, places
 
 
 def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
