@@ -294,7 +294,12 @@ class Placed:
                 return own
             told = Told(own_rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
-        tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
+        weights = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
+        if own is not None and told is not None:
+            weights[told.rows] = own.tails.weights
+        else:
+            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
+        tails = replace(self.identification.tails, weights=weights)
         at = nominal, theta, self.data.q
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
@@ -306,15 +311,6 @@ class Placed:
         y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
         worst = found.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point
         return TangentData(nominal, theta, table.q, y, noise, replace(found.tails, weights=worst))
-
-    def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
-        """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
-        weights = self.data.q.new_ones(len(self.data), bodies)
-        if own is not None and self.coordinates is not None:
-            weights[self.coordinates.rows] = own.tails.weights
-        else:
-            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
-        return weights
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:

@@ -169,7 +169,7 @@ class DeviceSet(ABC):
         return []
 
     def entry(self) -> dict[str, object]:
-        """The same for programs, in m and rad."""
+        """Where the devices are, for programs, in m and rad."""
         return {}
 
 
@@ -234,11 +234,9 @@ class Placement(tuple[DeviceSet, ...]):
         return data
 
     def sentences(self) -> list[str]:
-        """Where all devices are."""
         return [line for own in self for line in own.sentences()]
 
     def entry(self) -> dict[str, object]:
-        """The same for programs."""
         found: dict[str, object] = {}
         for own in self:
             found |= own.entry()
