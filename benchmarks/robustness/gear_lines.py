@@ -18,6 +18,7 @@ runs with any line that was not planted, `rms_without_um` and `rms_with_um` held
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 ROOMS = Path(__file__).parents[1]
@@ -103,7 +104,7 @@ def drawn(poses: int, draws: int) -> Record:
     for _ in range(draws):
         noise = torch.randn(len(factor), dtype=factor.dtype, generator=generator)
         y = data.y - data.target + (factor @ noise).view_as(data.y)
-        wrong += bool(find_gear_lines(data.with_measured(y), scales))
+        wrong += bool(find_gear_lines(replace(data, y=y), scales))
     return {"poses": poses, "runs": draws, "false": wrong / draws}
 
 

@@ -30,7 +30,6 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     estimate_tails,
     leave_one_out,
-    tails_of_many,
 )
 from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
@@ -119,7 +118,7 @@ def choose_scales(
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
         data = data.with_gear_lines(chosen.selection.scales.lines)
-        data = data.with_tails(tails_of_many(data, chosen.selection.scales, seed))
+        data = data.with_tails(estimate_tails(data, chosen.selection.scales, seed))
         return replace(chosen, data=data, left_out=leave_one_out(data, chosen.selection.scales, seed))
     if given is not None:
         data = data.with_gear_lines(given.lines)

@@ -118,16 +118,17 @@ class LinearFunctionals(Observation):
     """h(z) = A z - b: heights above planes, readings of dial gauges, single coordinates.
 
     Args:
-        axes: (N, r, m) rows A_i, such as unit normals. offsets: (N, r) b_i, m.
+        axes: (N, r, m) rows A_i, such as unit normals. offsets: (N, r) b_i, m; 0 by default.
 
     Constants of :meth:`by_constants`: for r = 1 the m - 1 turns of the axis by radians, then b; else only the r of b.
     """
 
     constants = ("axes", "offsets")
 
-    def __init__(self, axes: object, offsets: object) -> None:
+    def __init__(self, axes: object, offsets: object = None) -> None:
         self.axes = as_tensor(axes, "axes", ("N", "r", "m"), fix="pass r axes for every row").detach()
         shape = self.axes.shape[:2]
+        offsets = self.axes.new_zeros(shape) if offsets is None else offsets
         self.offsets = as_tensor(offsets, "offsets", tuple(shape), fix="pass one offset per axis, in m").detach()
 
     @property
@@ -222,6 +223,13 @@ class Part:
     points: Tensor
     numbers: Tensor
     observe: Observation
+
+    @classmethod
+    def of_coordinates(cls, rows: Tensor, count: int) -> Part:
+        """Rows (M,) that report the first coordinates as their first numbers."""
+        first = torch.arange(count, device=rows.device)
+        eye = torch.eye(count, dtype=torch.float64, device=rows.device)
+        return cls(rows, first, first, LinearFunctionals(eye.expand(len(rows), count, count)))
 
     def seen(self, points: Tensor) -> Tensor:
         """The coordinates (M, k) that it sees of points (N, m)."""

@@ -258,13 +258,19 @@ def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[st
     return [""] * rows if numbers is None else [names[number] if number >= 0 else "" for number in numbers.tolist()]
 
 
+def numbers_of(names: Sequence[str], known: Sequence[str]) -> Tensor:
+    """(N,) int64, numbers of names among the known ones, -1 for "": the inverse of :func:`texts_of`."""
+    numbers = {"": -1} | {name: number for number, name in enumerate(known)}
+    return torch.tensor([numbers[name] for name in names], dtype=torch.int64, device=HOST)
+
+
 def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
     """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
     if names is None:
         return None, ()
     texts = row_names(names, rows, "the names of sessions")
     known = tuple(dict.fromkeys(texts))
-    return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
+    return numbers_of(texts, known), known
 
 
 def checked_names(

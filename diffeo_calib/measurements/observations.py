@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows
+from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import (
     NO_SOCKET,
     RowGroups,
@@ -100,9 +100,8 @@ class Observations(RowGroups):
     @property
     def session(self) -> Tensor | None:
         """(N,) int64, number of each row's device or set-up in ``session_names``, -1 for none; None without any."""
-        numbers = {name: number for number, name in enumerate(self.session_names)} | {"": -1}
-        found = [numbers[name] for name in self.device_names]
-        return torch.tensor(found, dtype=torch.int64, device=HOST) if self.session_names else None
+        names = self.session_names
+        return numbers_of(self.device_names, names) if names else None
 
     @property
     def without_device(self) -> bool:

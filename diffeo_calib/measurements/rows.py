@@ -19,6 +19,7 @@ from diffeo_calib.measurements.checks import (
     chosen_rows,
     copied,
     covariates,
+    numbers_of,
     payloads,
     unlikely_si_joints,
 )
@@ -415,8 +416,7 @@ class RowTable(RowGroups):
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
         found = []
         for table in tables:
-            own, numbers = [*(names.index(name) for name in getattr(table, texts)), -1], getattr(table, column)
-            new = torch.tensor(own, dtype=torch.int64, device=HOST)
+            new, numbers = numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
             found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
         return found
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
-from diffeo_calib.measurements.checks import row_names, texts_of
+from diffeo_calib.measurements.checks import numbers_of, row_names, texts_of
 from diffeo_calib.measurements.rows import NO_SOCKET, RowTable, with_attributes
 
 if TYPE_CHECKING:
@@ -71,8 +71,7 @@ class Sockets:
     @property
     def place(self) -> Tensor:
         """(S,) int64, the place of each socket."""
-        known = self.place_names
-        return torch.tensor([known.index(_place(name)) for name in self.names], dtype=torch.int64, device=HOST)
+        return numbers_of([_place(name) for name in self.names], self.place_names)
 
 
 class SocketTable(RowTable):
@@ -232,9 +231,7 @@ def socket_numbers(
     """
     texts = row_names(names, rows, "`sockets`")
     known = tuple(dict.fromkeys(texts))
-    numbers = {name: number for number, name in enumerate(known)}
-    own = torch.tensor([numbers[text] for text in texts], dtype=torch.int64, device=HOST)
-    return own, Sockets(known, *_checked_distances(known, distances, distance_std))
+    return numbers_of(texts, known), Sockets(known, *_checked_distances(known, distances, distance_std))
 
 
 def _padded(values: Tensor, before: int, after: int) -> Tensor:

@@ -83,15 +83,9 @@ def reweight(squares: Tensor, dim: int | Tensor, prior: FreedomPrior = FREEDOM_P
     """
     seen = ~squares.isnan()
     freedom = _freedom(squares[seen], dim if isinstance(dim, int) else dim[seen], prior)
-    return weighed(squares, dim, inf if freedom >= prior.gaussian else freedom)
-
-
-def weighed(squares: Tensor, dim: int | Tensor, freedom: float) -> Tails:
-    """The weights that known degrees of freedom imply; arguments as of :func:`reweight`."""
-    if freedom == inf:
+    if freedom >= prior.gaussian:
         return Tails(inf, torch.ones_like(squares))
-    weights = (freedom + dim) / (freedom + squares)
-    return Tails(freedom, weights.nan_to_num(1.0))
+    return Tails(freedom, ((freedom + dim) / (freedom + squares)).nan_to_num(1.0))
 
 
 def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.placement import PLACES, place
-from diffeo_calib.robots.se3 import transforms, twist_transform
-from diffeo_calib.sensors.devices import Devices, least_squares, numbers_text
+from diffeo_calib.robots.placement import place
+from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose, numbers_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,25 +24,16 @@ class Trackers(Devices):
 
     kind = "marker"
     size_fix = "measure longer moves"
-    seen_points, numbers_each = 3, 3
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn of B, and a shift of the marker."""
-        return [PLACES.found_m_rad] * 9
+    seen_points, numbers_each, increments_each = 3, 3, 9
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
-        """Coordinates of the marker."""
         B, marker = constants[:12].view(3, 4), constants[12:]
         return B[:, :3] @ (body[:3, :3] @ marker + body[:3, 3]) + B[:, 3]
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        """Shifted and turned."""
-        B, marker = constants[:12].view(3, 4), constants[12:]
-        whole = twist_transform(increments[:6]) @ transforms(B[:, :3], B[:, 3])
-        return torch.cat([whole[:3].flatten(), marker + increments[6:]])
+        return torch.cat([moved_pose(constants[:12], increments[:6]), constants[12:] + increments[6:]])
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
@@ -52,7 +42,6 @@ class Trackers(Devices):
         return torch.cat([found.base[:3].flatten(), found.tool[0]])
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Its marker, and that it holds lengths."""
         marker, std = 1e3 * self.constants[number, 12:], 1e3 * deviations[6:]
         place = f"{numbers_text(marker.tolist())} +- {numbers_text(std.tolist())} mm in the measured frame"
         return f"marker of '{self.names[number]}': {place}; lengths are its own and the board's"
@@ -64,32 +53,23 @@ class Contacts(Devices):
 
     kind = "contact"
     size_fix = "measure poses too: contacts hold no lengths"
-    seen_points, numbers_each = 3, 3
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of two shifts."""
-        return [PLACES.found_m_rad] * 6
+    seen_points, numbers_each, increments_each = 3, 3, 6
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
-        """How far the ball is from the socket."""
         return body[:3, :3] @ constants[3:] + body[:3, 3] - constants[:3]
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        """Shifted."""
         return constants + increments
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
-        """Linear in both."""
         eye = torch.eye(3, dtype=values.dtype, device=values.device).expand(len(bodies), 3, 3)
         columns = torch.cat([eye, -bodies[:, :3, :3]], 2).flatten(0, 1)
         return least_squares(columns, (bodies[:, :3, 3] - values).flatten())
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Socket and ball."""
         place, ball = (numbers_text((1e3 * part).tolist()) for part in self.constants[number].split(3))
         std = 1e3 * float(deviations[:3].norm())
         what = f"socket '{self.names[number]}': {place} +- {std:.3f} mm in {frame}"

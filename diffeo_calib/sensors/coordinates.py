@@ -142,7 +142,6 @@ class Positions(Sensor):
         return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
-        """Distances, and angles of poses."""
         names, data = data.device_names, places.aligned(data)
         points = points[:, :-1] if places.ball and points.shape[1] == data.markers + 1 else points
         check_same_markers(points, data.points)
@@ -173,11 +172,12 @@ class Poses(Positions):
     options, fix = ", `convention` and `rotation_angle`", "leave the rotation out"
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
-        """As they are."""
         return data
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
-        measured = whole_frames(data)
+        if data.frames is None:
+            raise InputError.of("measured poses", got=f"{data.kind}s")
+        measured = data.frames
         frames = frames_of_points(points, data.bodies.pose_lever())
         away = measured[..., :3, 3] - frames[..., :3, 3]
         angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
@@ -191,12 +191,10 @@ class Contacts(Sensor):
     """A ball in sockets, perhaps beside measured positions."""
 
     def check(self, data: Measurements, model: Any) -> None:
-        """A ball in sockets is not what a tracker saw."""
         check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
         check_tips(data, model.on[-data.markers :])
 
     def rare(self, data: Measurements) -> list[str]:
-        """Sockets with one row."""
         return rare_names(data.row_sockets, data.line_numbers.tolist(), 2)
 
     def check_angles(self, data: Measurements, model: Any) -> None:
@@ -208,7 +206,7 @@ class Contacts(Sensor):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data)).away.norm(dim=1)
+            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data))[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
@@ -220,7 +218,6 @@ class Contacts(Sensor):
                 raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
-        """With hidden markers before the ball."""
         self.check(data, model)
         return data.with_markers(model.markers)
 
@@ -235,10 +232,9 @@ class Contacts(Sensor):
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        found = socket_errors(points[:, -1], *sockets_of(data))
-        size, away, lines = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.line_numbers
-        names = data.row_sockets
-        return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
+        away, distances = socket_errors(points[:, -1], *sockets_of(data))
+        size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
+        return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> None:
         """None: a ball in a socket is where the robot brought it."""
@@ -264,16 +260,16 @@ class OtherDevices(Sensor):
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
             model.bodies.pose_lever()
-            check_frames(data, model)
+            needed, known = (points // model.bodies.points for points in (kind_of(data).seen_points, model.markers))
+            if needed > known:
+                raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def with_points(self, data: Readings, model: Any) -> Readings:
-        """As they are."""
         return data
 
     def place(self, data: Readings, beside: Beside) -> Places:
-        """Devices that are not known."""
         known = beside.devices.get(data.kind)
         if known is not None and set(data.names) <= set(known.names):
             return Places(devices={data.column_kind: known})
@@ -290,7 +286,6 @@ class OtherDevices(Sensor):
         return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=numbers)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
-        """In the unit of the device."""
         devices = places.devices.get(data.column_kind)
         if devices is None:
             fix = "pass rows of the devices of the calibration"
@@ -382,13 +377,6 @@ def check_ball(model: Any, what: str, of: str, needed: str) -> None:
         raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
 
 
-def check_frames(data: Readings, model: Any) -> None:
-    """Raise InputError for readings of more frames than a model has."""
-    needed, known = kind_of(data).seen_points // model.bodies.points, model.markers // model.bodies.points
-    if needed > known:
-        raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
-
-
 def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
     """Raise MeasurementError if the measurements say that their points are on other tips than these of a model.
 
@@ -454,10 +442,3 @@ def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:
     if data.socket is None or data.sockets is None:
         raise InputError.of("rows in sockets", got=f"{data.kind}s")
     return data.socket.to(data.points.device), data.sockets
-
-
-def whole_frames(data: Measurements) -> Tensor:
-    """(N, T, 4, 4) measured poses; InputError for rows without."""
-    if data.frames is None:
-        raise InputError.of("measured poses", got=f"{data.kind}s")
-    return data.frames

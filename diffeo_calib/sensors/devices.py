@@ -18,11 +18,14 @@ from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
+from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import transforms, twist_transform
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -69,6 +72,8 @@ class Devices(ABC):
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
     """Points of the tool that it sees: the ball, or three of each measured frame."""
+    increments_each: ClassVar[int]
+    """Increments k of a device."""
     numbers_each: ClassVar[int] = 1
     """Numbers r of a reading."""
     metres_each: ClassVar[float] = 1.0
@@ -86,9 +91,9 @@ class Devices(ABC):
         """Constants (c,) of one device in closed form, from readings (N, r) of known bodies, see :meth:`bodies`."""
 
     @classmethod
-    @abstractmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
+        """Standard deviations of the k increments, m or rad, wide by default; ``offset_std``: see :class:`Readings`."""
+        return [PLACES.found_m_rad] * cls.increments_each
 
     @classmethod
     def columns(cls) -> Mapping[str, Sequence[str]]:
@@ -153,10 +158,6 @@ class Devices(ABC):
             None where there is no closed form: the search then starts with the point at the tip.
         """
         return None
-
-    @classmethod  # noqa: B027
-    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
-        """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
 
     @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
@@ -224,8 +225,7 @@ class Devices(ABC):
         if data.kind != self.kind or not set(data.names) <= set(self.names):
             expected, got = f"{self.kind}s of {few(self.names)}", f"{data.kind}s of {few(data.names)}"
             raise MeasurementError.of("`data`", expected=expected, got=got, fix="pass rows of the same devices")
-        own = [self.names.index(name) for name in data.names]
-        return torch.tensor(own, dtype=torch.int64, device=data.device.device)[data.device]
+        return numbers_of(data.names, self.names).to(data.device.device)[data.device]
 
     def errors(self, data: Readings, points: Tensor) -> Tensor:
         """Measured minus predicted readings (N, r), m, of the ball at points (N, 3), m."""
@@ -354,6 +354,12 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
     x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
     return vectors @ (x / x.norm())
+
+
+def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:
+    """The rows (..., 12) of a transform after a shift and a turn (..., 6) in the frame that it leads to, m and rad."""
+    T = rows.unflatten(-1, (3, 4))
+    return (twist_transform(twist) @ transforms(T[..., :3], T[..., 3]))[..., :3, :].flatten(-2)
 
 
 def numbers_text(values: list[float]) -> str:

@@ -34,24 +34,6 @@ def shown_unit(unit: str) -> tuple[str, float]:
     return ("mm", 1e3) if unit == "m" else (unit, 1.0)
 
 
-def errors_frame(errors: Any) -> Any:
-    """The errors of every row and marker as a pandas.DataFrame.
-
-    Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
-    and y of images) and error in the unit of the evaluation, and angle in rad for poses.
-
-    Raises:
-        ImportError: pandas is not installed.
-    """
-    N, P = errors.errors.shape
-    rows = torch.arange(N, device=HOST) if errors.line_numbers is None else errors.line_numbers
-    columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
-    if errors.away is not None:
-        columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=False))
-    columns["error"] = errors.errors.flatten()
-    return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles.flatten()})
-
-
 @dataclass(frozen=True)
 class DistanceError:
     """A known distance between two sockets, and the distance between the middles of predicted positions.
@@ -71,22 +53,13 @@ class DistanceError:
         return self.found - self.known
 
 
-@dataclass(frozen=True, eq=False)
-class SocketErrors:
-    """Spread and distances of predicted positions.
+def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[Tensor, tuple[DistanceError, ...]]:
+    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean.
 
-    Args:
-        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a
-            row that is alone in its socket, whose middle it is.
-        distances: those whose sockets both have rows.
+    Returns:
+        (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a row
+        that is alone in its socket, whose middle it is. Known distances between sockets that both have rows.
     """
-
-    away: Tensor
-    distances: tuple[DistanceError, ...]
-
-
-def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> SocketErrors:
-    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean."""
     inside = socket != NO_SOCKET
     own = socket[inside]
     count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
@@ -98,8 +71,7 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> Socket
         if seen[a] and seen[b]
     )
     judged = inside & (count > 1)[socket]
-    away = (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan)
-    return SocketErrors(away, distances)
+    return (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan), distances
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,7 +115,22 @@ class Evaluation:
         rows = torch.arange(len(self.errors), device=HOST)[chosen.cpu()].tolist()
         return replace(self, **some, devices=[self.devices[row] for row in rows] if self.devices else (), distances=())
 
-    to_frame = errors_frame
+    def to_frame(self) -> Any:
+        """The errors of every row and marker as a pandas.DataFrame.
+
+        Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
+        and y of images) and error in the unit of the evaluation, and angle in rad for poses.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        N, P = self.errors.shape
+        rows = torch.arange(N, device=HOST) if self.line_numbers is None else self.line_numbers
+        columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
+        if self.away is not None:
+            columns |= dict(zip("xyz", self.away.flatten(0, 1).T, strict=False))
+        columns["error"] = self.errors.flatten()
+        return data_frame(columns if self.angles is None else columns | {"angle": self.angles.flatten()})
 
     @property
     def title(self) -> str:

@@ -15,11 +15,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import few
 from diffeo_calib.maps.observation import LinearFunctionals
-from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import (
     Devices,
     across,
@@ -28,13 +26,10 @@ from diffeo_calib.sensors.devices import (
     unit_least_squares,
 )
 
-LARGEST_UNEXPLAINED, FEWEST_SPARE_ROWS = 1e-2, 5
-"""Share of the heights' variance, and rows of a plane beyond its unknowns, that say something about their unit."""
 LEAST_SHARE = 1e-4
 """Directions of the unknowns that data determine less than this, relative to the best one, are left at zero."""
-UNIT_RATIO, OTHER_UNIT, CORRELATED = 10.0, 0.5, 0.5
-"""Factor between measured and found heights that is doubted, its relative error from which it is no unit's, and their
-correlation that shows it."""
+UNIT_RATIO, CORRELATED = 10.0, 0.5
+"""Factor between measured and found heights that is doubted, and their correlation that shows it."""
 FLAT_SHARE = 0.2
 """Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
 PARALLEL_SINE = 0.1
@@ -47,16 +42,11 @@ class Planes(Devices):
 
     kind = "height"
     stated_as = "NX,NY,NZ,D"
+    increments_each = 3
     size_fix = "touch a gauge block of known height on the same planes too and give its height"
 
     @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of two turns and a shift."""
-        return [PLACES.found_m_rad] * 3
-
-    @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
-        """Of gauges."""
         return {"height": ("height", "gauge", "dial", "dial_gauge", "indicator")}
 
     @classmethod
@@ -73,7 +63,6 @@ class Planes(Devices):
         return torch.cat([normal, (points @ normal - values).mean()[None]])
 
     def observation(self, device: Tensor) -> LinearFunctionals:
-        """Heights."""
         own = self.constants[device]
         return LinearFunctionals(own[:, None, :3], own[:, 3:])
 
@@ -84,11 +73,9 @@ class Planes(Devices):
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
 
     def where(self, number: int) -> str:
-        """The normal."""
         return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Normal and distance."""
         *normal, distance = self.constants[number].tolist()
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
         what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
@@ -96,7 +83,6 @@ class Planes(Devices):
 
     @classmethod
     def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The linear equations above."""
         values, one = data.values[:, 0], torch.ones_like(data.values)
         others = torch.cat([R.flatten(1), -one], 1)  # their unknowns follow from the normal
         basis = torch.linalg.svd(others, full_matrices=False)
@@ -107,20 +93,16 @@ class Planes(Devices):
         return found[:9].view(3, 3).mT @ n, torch.cat([n, found[9:]])
 
     @classmethod
-    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
-        """Heights per height that the tip's poses explain."""
-        factor = height_factor(data, R, t)
-        if factor > UNIT_RATIO:
-            what = f"the heights are about {factor:.3g} times larger than the robot moves along the planes' normals"
-            text = sentence(what, fix="check the unit of the heights (mm or m)")
-            if in_other_unit(factor, OTHER_UNIT):
-                raise MeasurementError(text)
-            warn_user(text)
-
-    @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
-        """By how much the ball's heights change per change of the measured ones."""
-        return not 1 / UNIT_RATIO < _factor(data, errors) < UNIT_RATIO
+        """By how much the ball's heights change per change of the measured ones, where they change together."""
+        measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
+        whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
+        mean = whose / whose.sum(0)
+        measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
+        together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
+        if together < CORRELATED * size or size == 0.0:
+            return False
+        return not 1 / UNIT_RATIO < together / float(measured.square().sum()) < UNIT_RATIO
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """Directions that no plane faces."""
@@ -136,35 +118,3 @@ class Planes(Devices):
             parallel = f" ({few(alike)} are parallel)" * bool(alike)
             what = f"no plane faces some directions{parallel}: errors of the ball along them are not measured"
             yield what, "add planes in other directions, best three at right angles"
-
-
-def height_factor(data: Readings, R: Tensor, t: Tensor) -> float:
-    """Measured heights per height that the tip's poses explain, the largest of the planes; 1 where they explain none.
-
-    Args:
-        data: heights. R: (N, 3, 3), t: (N, 3), the tip's poses in the base, m.
-    """
-    factors = [1.0]
-    for number in range(len(data.names)):
-        own = data.device == number
-        matrix, heights = torch.cat([t, R.flatten(1), -torch.ones_like(t[:, :1])], 1)[own], data.values[own, 0]
-        spare = len(heights) - matrix.shape[1]
-        if spare < FEWEST_SPARE_ROWS or not bool(heights.any()):
-            continue
-        found = least_squares(matrix, heights)
-        unexplained = (heights - matrix @ found).square().sum() / spare
-        if float(unexplained) < LARGEST_UNEXPLAINED * float(heights.var()):
-            factors.append(float(found[:3].norm()))
-    return max(factors)
-
-
-def _factor(data: Readings, errors: Tensor) -> float:
-    """By how much the ball's heights change per change of the measured ones; 1 if they hardly change together."""
-    measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
-    whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
-    mean = whose / whose.sum(0)
-    measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
-    together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
-    if together < CORRELATED * size or size == 0.0:
-        return 1.0
-    return together / float(measured @ measured)

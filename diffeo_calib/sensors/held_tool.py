@@ -17,9 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
-from diffeo_calib.sensors.devices import Devices, numbers_text
+from diffeo_calib.robots.se3 import nearest_rotations
+from diffeo_calib.sensors.devices import Devices, moved_pose, numbers_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +27,7 @@ class HeldTools(Devices):
 
     kind = "held tool"
     size_fix = "measure poses too: a held tool holds no lengths"
-    seen_points, numbers_each = 2 * POINTS, 6
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn."""
-        return [PLACES.found_m_rad] * 6
+    seen_points, numbers_each, increments_each = 2 * POINTS, 6, 6
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
@@ -50,9 +44,7 @@ class HeldTools(Devices):
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
         """Shifted and turned in the first hand's frame."""
-        held = constants.view(3, 4)
-        whole = twist_transform(increments) @ transforms(held[:, :3], held[:, 3])
-        return whole[:3].flatten()
+        return moved_pose(constants, increments)
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
@@ -63,7 +55,6 @@ class HeldTools(Devices):
         return torch.cat([R, shift], 1).flatten()
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Where it has the second hand."""
         place = (1e3 * self.constants[number].view(3, 4)[:, 3]).tolist()
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
         what = f"held tool '{self.names[number]}': the second hand at {numbers_text(place)} +- {shift:.3f} mm"

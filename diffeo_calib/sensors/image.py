@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
+from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,
     Devices,
     Hypothesis,
+    moved_pose,
     numbers_text,
 )
 
@@ -29,12 +29,8 @@ class Cameras(Devices):
 
     kind = "image"
     stated_as = "X,Y,Z,TX,TY,TZ"
+    increments_each = 6
     size_fix = "trust angles and shapes only, or measure distances, which hold lengths"
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of a shift and a turn."""
-        return [PLACES.found_m_rad] * 6
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
@@ -54,7 +50,6 @@ class Cameras(Devices):
         return torch.cat([torch.cat([R, t], 2).flatten(1), depth], 1)
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
-        """Whether points are in the field of view."""
         own = self.poses[device]
         seen = (own[:, :3, :3] @ points[:, :, None])[..., 0] + own[:, :3, 3]
         return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
@@ -73,7 +68,6 @@ class Cameras(Devices):
 
     @property
     def metres(self) -> Tensor:
-        """The mean depth of the ball."""
         return self.constants[:, 12]
 
     @property
@@ -88,8 +82,8 @@ class Cameras(Devices):
 
     def moved(self, increments: Tensor) -> Devices:
         """Shifted and turned in the cameras' own frames."""
-        moved = twist_transform(increments) @ self.poses
-        return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
+        moved = moved_pose(self.constants[:, :12], increments)
+        return replace(self, constants=torch.cat([moved, self.constants[:, 12:]], 1))
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""
@@ -108,12 +102,10 @@ class Cameras(Devices):
                 yield Hypothesis(words, own, ("%", 1e-2), fix, said=True)
 
     def where(self, number: int) -> str:
-        """The place."""
         pose = self.poses[number]
         return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Place and direction of view."""
         pose = self.poses[number]
         place = (-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist()
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())

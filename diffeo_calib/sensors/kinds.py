@@ -23,8 +23,6 @@ KINDS: dict[str, type[Devices]] = {
     kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)
 }
 
-GROUP = "diffeo_calib.sensors"
-
 
 def register(kind: type[Devices]) -> type[Devices]:
     """Make a kind of device known, a concrete subclass of :class:`Devices`; can decorate its class.
@@ -32,7 +30,8 @@ def register(kind: type[Devices]) -> type[Devices]:
     Raises:
         InputError: no such subclass, or the name of another kind.
     """
-    if not (isinstance(kind, type) and issubclass(kind, Devices)) or kind.__abstractmethods__:
+    whole = isinstance(kind, type) and issubclass(kind, Devices) and not kind.__abstractmethods__
+    if not whole or (kind.prior.__func__ is Devices.prior.__func__ and not hasattr(kind, "increments_each")):
         expected = "a subclass of Devices with all of its methods"
         raise InputError.of("a kind of device", expected=expected, got=repr(kind))
     if KINDS.get(kind.kind, kind).__qualname__ != kind.__qualname__:
@@ -43,14 +42,10 @@ def register(kind: type[Devices]) -> type[Devices]:
 
 
 @cache
-def _load_installed() -> None:
-    for found in entry_points(group=GROUP):
-        found.load()
-
-
 def known_kinds() -> dict[str, type[Devices]]:
     """All kinds by their names, those of installed packages too."""
-    _load_installed()
+    for found in entry_points(group="diffeo_calib.sensors"):
+        found.load()
     return KINDS
 
 

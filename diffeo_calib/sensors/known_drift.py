@@ -82,7 +82,9 @@ class KnownDrift:
     def points(self, kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
         """Points (N, P, 3) of a model at rows, as the drift moved them, m."""
         moved = self.ramp(data) @ self.sizes.to(data.q)
-        return self._drifted(kinematics(data.q + moved[:, OFFSETS:]).detach(), moved)
+        centre, R = self.centre.to(moved), torch.linalg.matrix_exp(skew(moved[:, 3:FRAME]))
+        away = kinematics(data.q + moved[:, OFFSETS:]).detach() - centre
+        return centre + moved[:, None, :3] + (1.0 + moved[:, GROWTH, None, None]) * (away @ R.mT)
 
     def aligned(self, data: Any) -> Any:
         """Measured positions as they would be in the middle of the columns, which they then do not tell any more."""
@@ -94,12 +96,6 @@ class KnownDrift:
         T[:, :3, :3] = R
         T[:, :3, 3] = centre - (R @ (centre + moved[:, :3])[..., None])[..., 0] - shrunk
         return with_attributes(data.in_frames(T), q=data.q + moved[:, OFFSETS:]).with_covariates()
-
-    def _drifted(self, places: Tensor, moved: Tensor) -> Tensor:
-        away = places - self.centre.to(places)
-        R = torch.linalg.matrix_exp(skew(moved[:, 3:FRAME]))
-        grown = (1.0 + moved[:, GROWTH, None, None]) * (away @ R.mT)
-        return self.centre.to(places) + moved[:, None, :3] + grown
 
     def holds(self) -> str:
         """For which values the model itself holds."""

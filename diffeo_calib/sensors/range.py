@@ -18,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, Hypothesis, least_squares, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
@@ -36,12 +35,12 @@ class FixedPoints(Devices):
 
     kind = "distance"
     stated_as = "X,Y,Z"
+    increments_each = 4
     size_fix = "measure longer and more different distances, or with a known zero"
 
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of the point, and of the offset."""
-        return [PLACES.found_m_rad] * 3 + [offset_std or FIXED_DEVIATION_M]
+        return [*super().prior()[:3], offset_std or FIXED_DEVIATION_M]
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
@@ -51,7 +50,6 @@ class FixedPoints(Devices):
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
-        """The fixed points."""
         return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
 
     @classmethod
@@ -62,20 +60,16 @@ class FixedPoints(Devices):
         return torch.cat([found[:3], found.new_zeros(1)])
 
     def observation(self, device: Tensor) -> Distances:
-        """Distances."""
         own = self.constants[device]
         return Distances(own[:, :3], own[:, 3:])
 
     def moved(self, increments: Tensor) -> Devices:
-        """Sums."""
         return replace(self, constants=self.constants + increments)
 
     def where(self, number: int) -> str:
-        """The fixed point."""
         return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        """Place, and zero where it was unknown."""
         found, std = (1e3 * self.constants[number]).tolist(), (1e3 * deviations).tolist()
         zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[3] > FIXED_DEVIATION_M)
         place = f"{numbers_text(found[:3])} +- {numbers_text(std[:3])} mm in {frame}"
@@ -83,7 +77,6 @@ class FixedPoints(Devices):
 
     @classmethod
     def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The linear equations above."""
         values, one = data.values[:, 0], torch.ones_like(data.values)
         columns = [-2 * t, 2 * (R.mT @ t[:, :, None])[..., 0], -2 * R.flatten(1), one]
         columns += [2 * values[:, None]] * bool(data.offset_std)
@@ -92,7 +85,6 @@ class FixedPoints(Devices):
         return found[3:6], torch.cat([found[:3], offset])
 
     def freed(self) -> FixedPoints | None:
-        """With an unknown zero."""
         if float(self.deviations[3]) > FIXED_DEVIATION_M:
             return None
         free = self.deviations.clone()
@@ -100,7 +92,6 @@ class FixedPoints(Devices):
         return replace(self, deviations=free)
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
-        """The zero, and the place of the fixed end."""
         effects = self.observation(device).by_constants(points)
         yield Hypothesis("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
         for name, own in self._of_each(effects, device):

@@ -18,8 +18,9 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import largest_known
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.pose_frames import frames_of_points
-from diffeo_calib.measurements.poses import poses_from_marks, poses_of_triangles
+from diffeo_calib.measurements.poses import angle_between, poses_from_marks, poses_of_triangles
 from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
@@ -191,8 +192,7 @@ class SetUps(ABC):
 
     def of_rows(self, data: Measurements) -> Tensor:
         """(N, c) the constants of every row."""
-        known = [*("" if name == ROWS else name for name in self.names), ""]
-        whose = torch.tensor([known.index(name) for name in data.device_names], dtype=torch.int64, device=HOST)
+        whose = numbers_of(data.device_names, ["" if name == ROWS else name for name in self.names])
         return torch.cat([self.constants, self.same[None]])[whose].to(data.points)
 
 
@@ -204,7 +204,7 @@ class MeasuringFrames(SetUps):
 
     @classmethod
     def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MeasuringFrames:
-        """See :class:`SetUps`: the markers stay; points may have a ball as one more."""
+        """The markers stay; points may have a ball as one more."""
         names, own = sessions_of(data)
         predicted = predicted[:, : data.markers]
         check_same_markers(predicted, data.points)
@@ -215,31 +215,26 @@ class MeasuringFrames(SetUps):
         return cls(names, found, found[:, :0], turns, names, free)
 
     def aligned(self, data: Measurements) -> Measurements:
-        """See :class:`SetUps`."""
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
 
     def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
-        """See :class:`SetUps`: what is left of the differences between the frames, and markers mounted again."""
+        """What is left of the differences between the frames, and markers mounted again."""
         frame = self.unit * frame_slopes(points, centre)
         frame = frame if slopes is None else slopes @ frame
         return torch.cat([frame, PLACES.remounted_m * by_tool], 2)[..., : self.increments_each]
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         step = twist_transform(steps[:, :NUMBERS_OF_A_FRAME])
         step[:, :3, 3] += centre - step[:, :3, :3] @ centre
         return (constants.unflatten(1, (4, 4)) @ T @ step @ torch.linalg.inv(T)).flatten(1)
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         return (self.constants.unflatten(1, (4, 4)) @ torch.linalg.inv(T)).flatten(1)
 
     def views(self) -> list[View]:
-        """See :class:`SetUps`."""
         return [lambda poses, T=T: T @ poses for T in self.constants.unflatten(1, (4, 4))]
 
     def sentence(self, number: int) -> str:
-        """See :class:`SetUps`."""
         shift, turn = _size(self.constants[number])
         away = f"{1e3 * shift:.4g} mm and {1e3 * turn:.4g} mrad away from that of the model"
         return f"session '{self.names[number]}': its frame is {away}"
@@ -253,7 +248,6 @@ class MountedMarkers(SetUps):
 
     @classmethod
     def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MountedMarkers:
-        """See :class:`SetUps`."""
         names, whose = sessions_of(data)
         P = min(data.markers, predicted.shape[1])
         away = _turned(turns, data)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
@@ -262,24 +256,19 @@ class MountedMarkers(SetUps):
         return cls(names, shifts, deviations, turns, names, 3 * data.markers)
 
     def aligned(self, data: Measurements) -> Measurements:
-        """See :class:`SetUps`."""
         shifts = self.of_rows(data).unflatten(1, (-1, 3))
         return data.shifted(-(_turned(self.turns, data)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
 
     def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         return self.unit * by_tool
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         return constants + steps
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         return self.constants + markers.flatten()[: self.constants.shape[1]]
 
     def sentence(self, number: int) -> str:
-        """See :class:`SetUps`."""
         shift, std = (values[number].view(-1, 3) for values in (self.constants, self.deviations))
         sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
         seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
@@ -289,7 +278,6 @@ class MountedMarkers(SetUps):
 
     @property
     def same(self) -> Tensor:
-        """See :class:`SetUps`."""
         return self.constants.new_zeros(self.constants.shape[1])
 
 
@@ -301,7 +289,6 @@ class MountedFrames(SetUps):
 
     @classmethod
     def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MountedFrames:
-        """See :class:`SetUps`."""
         names, whose = sessions_of(data)
         lever = data.bodies.pose_lever()
         X = frames_of_points(predicted[:, :3], lever)[:, 0]
@@ -313,23 +300,19 @@ class MountedFrames(SetUps):
         return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, names, NUMBERS_OF_A_FRAME)
 
     def aligned(self, data: Measurements) -> Measurements:
-        """See :class:`SetUps`."""
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))
 
     def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         found = self.unit * own_slopes(points[:, :3])
         return found if slopes is None else slopes[..., : found.shape[1]] @ found
 
     def in_any_frame(self, data: Measurements) -> Measurements:
-        """See :class:`SetUps`."""
         if not data.remounted or not set(data.device_names) <= {*self.names, ""}:
             return data
         names = {"session": data.session, "session_names": data.session_names, "remounted": True}
         return with_attributes(self.aligned(data), **names)
 
     def after(self, known: SetUps) -> MountedFrames:
-        """See :class:`SetUps`."""
         if not set(self.names) <= set(known.names):
             return self
         own = [known.names.index(name) for name in self.names]
@@ -339,22 +322,18 @@ class MountedFrames(SetUps):
         return replace(self, constants=(M @ before).flatten(1), deviations=deviations)
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         return (twist_transform(steps) @ constants.unflatten(1, (4, 4))).flatten(1)
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        """See :class:`SetUps`."""
         old, new = (poses_of_triangles(points[:, :3]) for points in (before, after))
         change = torch.linalg.inv(new) @ T @ old
         mean = transforms(nearest_rotations(change[:, :3, :3].mean(0)), change[:, :3, 3].mean(0))
         return (mean @ self.constants.unflatten(1, (4, 4))).flatten(1)
 
     def views(self) -> list[View]:
-        """See :class:`SetUps`."""
         return [lambda poses, M=M: poses @ M for M in self.constants.unflatten(1, (4, 4))]
 
     def sentence(self, number: int) -> str:
-        """See :class:`SetUps`."""
         shift, turn = _size(self.constants[number])
         known, degrees = 1e3 * float(self.deviations[number, :3].norm()), turn * 180.0 / torch.pi
         away = f"{1e3 * shift:.3f} +- {known:.3f} mm and {degrees:.3f} degrees away on the tool from the model's"
@@ -427,7 +406,7 @@ def _turned(turns: Turns | None, data: Measurements) -> Tensor:
 def _size(constants: Tensor) -> tuple[float, float]:
     """Shift, m, and turn, rad, of a transform (16,)."""
     T = constants.view(4, 4)
-    return float(T[:3, 3].norm()), float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+    return float(T[:3, 3].norm()), float(angle_between(torch.eye(3, dtype=T.dtype, device=T.device), T[:3, :3]))
 
 
 def _middle(away: Tensor) -> tuple[Tensor, Tensor]:

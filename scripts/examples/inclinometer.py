@@ -13,7 +13,6 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.poses import poses_of_triangles
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
@@ -34,13 +33,8 @@ class Inclinometers(Devices):
     kind = "inclination"
     size_fix = "measure poses too: angles hold no lengths"
     stated_as = "XX,XY,XZ,YX,YY,YZ,UX,UY,UZ"
-    seen_points, numbers_each = 3, 2
+    seen_points, numbers_each, increments_each = 3, 2, 5
     metres_each, unit = 0.1, ("mrad", 1e3)
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of five turns."""
-        return [PLACES.found_m_rad] * 5
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:

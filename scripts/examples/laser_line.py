@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
 from diffeo_calib.sensors.kinds import register
@@ -23,12 +22,8 @@ class Beams(Devices):
 
     kind = "line distance"
     stated_as = "PX,PY,PZ,DX,DY,DZ"
+    increments_each = 4
     size_fix = "measure distances, which hold lengths"
-
-    @classmethod
-    def prior(cls, offset_std: float = 0.0) -> list[float]:
-        """Of two shifts and two turns."""
-        return [PLACES.found_m_rad] * 4
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:

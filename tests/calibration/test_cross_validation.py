@@ -115,7 +115,7 @@ def drawn(setting: Setting, seed: int) -> TangentData:
     data = setting.tangent_data
     factor = torch.linalg.cholesky(covariance(data, setting.scales))
     target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
-    return data.with_measured(data.y + target - data.target)
+    return replace(data, y=data.y + target - data.target)
 
 
 def test_right_scales_predict_folds_with_errors_as_large_as_the_measured_ones() -> None:
@@ -145,7 +145,7 @@ def test_outliers_hardly_change_the_factor() -> None:
     y[3] += 5e-3
     weights = torch.ones_like(clean.tails.weights)
     weights[3] = 1e-5
-    wrong = clean.with_measured(y).with_tails(Tails(4.0, weights))
+    wrong = replace(clean, y=y).with_tails(Tails(4.0, weights))
     before, after = (
         cross_validated_inflation(setting.scales, setting.scales, data, groups(data), limits=BRIEF)
         for data in (clean, wrong)

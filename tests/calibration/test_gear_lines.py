@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 
 import pytest
@@ -38,7 +39,7 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
     y = data.y + (torch.linalg.cholesky(matrix) @ noise).view_as(data.y)
     for joint, frequency, amplitude in lines:
         y = y + amplitude * data.jacobian[..., joint] * (frequency * q[:, joint, None] + 0.7).sin()
-    return data.with_measured(y), scales
+    return replace(data, y=y), scales
 
 
 def test_planted_lines_are_found() -> None:

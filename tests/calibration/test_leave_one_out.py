@@ -40,7 +40,7 @@ def moved(data: TangentData, row: int, coordinates: slice, by: float) -> Tangent
     """The same measurements, one of them wrong."""
     y = data.y.clone()
     y[row, coordinates] += by
-    return data.with_measured(y)
+    return replace(data, y=y)
 
 
 def chosen(setting: Setting) -> Chosen:
@@ -109,7 +109,7 @@ def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
     assert data.noise_model.modes is not None
     y = data.y.clone()
     y[5] += data.noise_model.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
-    tails = estimate_tails(data.with_measured(y), framed.scales)
+    tails = estimate_tails(replace(data, y=y), framed.scales)
     assert tails.weights.shape == (12, 1)
     assert int(tails.weights.argmin()) == 5
     assert float(tails.weights[5]) < 0.05

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,7 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
     data, order = setting.tangent_data, torch.arange(14)
 
     def gains(factor: float) -> Tensor:
-        moved = data.with_measured(data.y + (factor - 1.0) * data.target)
+        moved = replace(data, y=data.y + (factor - 1.0) * data.target)
         found = findings(changes_of(data), moved.process(setting.scales), order)
         return torch.tensor([one.gain for one in found], dtype=torch.float64)
 

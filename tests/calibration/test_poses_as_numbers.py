@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -38,7 +40,7 @@ def naive(setting: Setting, data: TangentData) -> tuple[Tensor, Tensor]:
 
 def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
     """Mean and covariance of k1 at the rows, by numpy with nine coordinates a pose."""
-    data = posed.tangent_data.with_measured(posed.tangent_data.y + 1e-5 * normal(12, 9, seed=3))
+    data = replace(posed.tangent_data, y=posed.tangent_data.y + 1e-5 * normal(12, 9, seed=3))
     G, R = naive(posed, data)
     nominal, S = data.told.nominal, data.told.nominal.sensitivities(data.x, data.theta)
     target = (data.y - nominal(data.x, data.theta) + S @ data.theta).flatten()

@@ -59,7 +59,7 @@ def test_rows_are_those_of_the_whole(setting: Setting) -> None:
 def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(setting: Setting) -> None:
     data = setting.tangent_data
     target = data.target
-    moved = data.with_measured(data.y + 1e-3)
+    moved = replace(data, y=data.y + 1e-3)
     assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
     assert_close(moved.told.noise(setting.scales), data.told.noise(setting.scales), rtol=0, atol=0)
     halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
@@ -125,7 +125,7 @@ def test_k0_is_linearised_once() -> None:
         part = data.rows(torch.tensor([3, 1]))
         part.process(scales)
         data.with_tails(Tails.none(*data.tails.weights.shape)).process(scales)
-        data.with_measured(data.y).process(scales)
+        replace(data, y=data.y).process(scales)
         data.sample(5, 900, 0)[1].process(scales)
     assert count == dict.fromkeys(ONCE, len(data.x))
 
@@ -175,7 +175,7 @@ def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> Non
     kept.process(first)
     some = kept.rows(torch.arange(3))
     orders = [(kept.with_tails(other.tails), first), (kept, second), (kept, first), (some, first)]
-    for data, scales in [*orders, (kept.with_measured(kept.y + 1e-3), first)]:
+    for data, scales in [*orders, (replace(kept, y=kept.y + 1e-3), first)]:
         assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
 
 

@@ -92,7 +92,7 @@ def test_estimates_are_spread_as_their_covariance_says() -> None:
     for seed in range(60):
         u = one.variance.sqrt() * normal(K, seed=seed)
         y = numbers.S @ u + F @ normal(len(numbers.target), seed=1000 + seed)
-        drawn = one.data.with_measured(one.data.y + y.view_as(one.data.y) - one.data.target)
+        drawn = replace(one.data, y=one.data.y + y.view_as(one.data.y) - one.data.target)
         error = drawn.process(one.scales).estimate - u
         squares.append(torch.linalg.solve_triangular(root, error[:, None], upper=False).square().mean())
     assert float(torch.stack(squares).mean()) == pytest.approx(1.0, abs=4.0 * (2.0 / (60 * K)) ** 0.5)

@@ -228,12 +228,10 @@ class ReadRows(NamedTuple):
 
     @property
     def q(self) -> Tensor:
-        """See :class:`MeasuredPoints`."""
         return self.data.q
 
     @property
     def freedom(self) -> int:
-        """See :class:`MeasuredPoints`."""
         return self.devices.freedom
 
     def moved(self, shifts: Tensor) -> Devices:
@@ -241,11 +239,9 @@ class ReadRows(NamedTuple):
         return self.devices.moved(shifts.view(len(self.devices.names), -1) * self.devices.deviations)
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        """See :class:`MeasuredPoints`."""
         return -self.moved(shifts).errors(self.data, points[:, 0])[:, None]
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        """See :class:`MeasuredPoints`."""
         devices, ball = self.moved(shifts), points[:, 0]
         device = devices.numbers(self.data)
         own = devices.observation(device).slope(ball) @ by_errors[:, 0]

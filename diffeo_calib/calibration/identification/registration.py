@@ -27,6 +27,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
     LIMITS,
+    MEDIAN_CHI2_3,
     Identification,
     MeasuredPoints,
     Prior,
@@ -201,7 +202,7 @@ def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int)
     """The registration as other registrations are described. Errors of the robot do not average out over its rows."""
     rms = float(distances.square().mean().sqrt())
     median = float(distances.median())
-    noise = max(median / sqrt(2.37), LIMITS.smallest_noise_m)
+    noise = max(median / sqrt(MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
     white = A.flatten(0, 1) * PLACES.marker_m / (noise * sqrt(rows))
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     covariance = A.new_zeros(geometry.size, geometry.size)

@@ -57,7 +57,6 @@ class Drift(DeviceSet):
         return self.known.sizes.numel()
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`."""
         places = data.points.unflatten(1, (-1, 3))
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         frame, away = FRAME_M_RAD * frame_slopes(places, centre), (places - centre).flatten(1)[..., None]
@@ -68,7 +67,6 @@ class Drift(DeviceSet):
         return (whole[:, :, None] * ramp[:, None, :, None]).flatten(2)
 
     def settled(self, found: Settled) -> Drift:
-        """See :class:`DeviceSet`."""
         own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.known.joints))
         shifts, deviations = (
             own * each.view(len(self.known.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
@@ -77,14 +75,13 @@ class Drift(DeviceSet):
         return replace(self, known=known, centre=found.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
-        """See :class:`DeviceSet`: rows that do not tell the columns are those of the middle."""
+        """Rows that do not tell the columns are those of the middle."""
         q, values = other.data.q, other.data.covariates
         middle = (0.5 * (self.known.lowest + self.known.highest)).expand(len(q), -1)
         values = values if other.data.covariate_names == self.known.names else middle
         return replace(self, values=values, q=q, centre=other.centre)
 
     def placed(self) -> PlacedDevices:
-        """The drift, for rows that tell the columns."""
         return self.known.placed()
 
     def sentences(self) -> list[str]:
@@ -92,5 +89,5 @@ class Drift(DeviceSet):
         return list(self.known.sentences())
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`: unknowns in m and rad over the range of every column."""
+        """Unknowns in m and rad over the range of every column."""
         return {"drift": dict(zip(self.known.names, self.known.sizes.tolist(), strict=True))}

@@ -53,23 +53,19 @@ class CameraErrors(DeviceSet):
 
     @property
     def size(self) -> int:
-        """Errors of lenses and board."""
         return self.shared.slopes.shape[2]
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`."""
         found = data.y.new_zeros(*data.y.shape, self.size)
         found[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
         return found
 
     def with_rows(self, other: OtherRows) -> Any:
-        """See :class:`DeviceSet`."""
         if other.coordinates is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
         return replace(self.in_own_frame(other.coordinates.table), rows=other.coordinates.rows)
 
     def in_own_frame(self, table: Measurements) -> Any:
-        """See :class:`DeviceSet`."""
         (shared,) = table.shared_errors()
         return replace(self, shared=shared)
 
@@ -133,7 +129,6 @@ class LensAndBoard(CameraErrors):
         warn_user(sentence(f"{what}: {got}", fix=fix))
 
     def settled(self, found: Settled) -> LensAndBoard:
-        """See :class:`DeviceSet`."""
         spread, cameras, explained = torch.linalg.cholesky(found.covariance), {}, []
         for number, (name, camera) in enumerate(self.shared.cameras.items()):
             change, root = camera.root @ found.shifts, camera.root @ spread
@@ -146,12 +141,11 @@ class LensAndBoard(CameraErrors):
         return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """See :class:`DeviceSet`: whether the camera of the row sees its board."""
         seen = self._boards(row, points, views)
         return super().sees(row, points, views) if seen is None else sees(*seen)
 
     def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """See :class:`DeviceSet`: with the errors of images there; where it is not seen, as at another place."""
+        """With the errors of images there; where it is not seen, as at another place."""
         seen = self._boards(row, points, views)
         if seen is None or seen[0].view is None:
             return like
@@ -176,7 +170,6 @@ class LensAndBoard(CameraErrors):
         return camera, inverse_poses(poses) if self.on_tool else poses
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         numbers = torch.stack([own.numbers for own in self._cameras])
         deviations = torch.stack([own.camera.deviations for own in self._cameras])
         return PlacedDevices(CAMERA, tuple(self.shared.cameras), numbers, deviations, self.rows, self.shared.seen_by)
@@ -187,7 +180,6 @@ class LensAndBoard(CameraErrors):
         return [BoardCamera(camera, self.on_tool, explained) for camera, explained in each]
 
     def sentences(self) -> list[str]:
-        """See :class:`DeviceSet`."""
         lines = list(camera_sentences(dict(zip(self.shared.cameras, self._cameras, strict=True))))
         if abs(self.larger) >= SIZE_WARNED:
             lines.append(
@@ -197,11 +189,9 @@ class LensAndBoard(CameraErrors):
         return lines
 
     def size_advice(self) -> str:
-        """See :class:`DeviceSet`."""
         return "measure the printed squares with a caliper and give `images --board-std`"
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`."""
         found = {
             name: own.camera.entry() | {"explained_m": vars(own.explained) | {"arm": own.explained.arm}}
             for name, own in zip(self.shared.cameras, self._cameras, strict=True)

@@ -19,9 +19,10 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.labels import OtherLabel, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherRows, Placement
@@ -33,14 +34,14 @@ from diffeo_calib.calibration.placing.readings import (
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
+from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
+from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
@@ -83,8 +84,8 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
     kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
     first, modes = 0, None
     if own is not None:
-        rows, m = own.rows, own.y.shape[1]
-        parts.append(coordinates_of(rows, m, q))
+        rows = own.rows
+        parts.append(Part.of_coordinates(rows, own.y.shape[1]))
         y[rows], visible[rows] = own.y, own.noise_model.coordinates(own.y)
         if own.noise_model.known is not None:
             known[rows] = own.noise_model.known
@@ -115,12 +116,6 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
         kinds=kinds if int(kinds.max()) else None,
     )
     return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
-
-
-def coordinates_of(rows: Tensor, m: int, like: Tensor) -> Part:
-    """Rows (M,) that report the first m coordinates as their first m numbers."""
-    eye, whole = torch.eye(m, dtype=like.dtype, device=like.device), torch.arange(m, device=like.device)
-    return Part(rows, whole, whole, LinearFunctionals(eye.expand(len(rows), m, m), like.new_zeros(len(rows), m)))
 
 
 LOG = logging.getLogger(__name__)
@@ -299,7 +294,12 @@ class Placed:
                 return own
             told = Told(own_rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
-        tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
+        weights = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
+        if own is not None and told is not None:
+            weights[told.rows] = own.tails.weights
+        else:
+            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
+        tails = replace(self.identification.tails, weights=weights)
         at = nominal, theta, self.data.q
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
@@ -309,16 +309,8 @@ class Placed:
         noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
         seen, predicted = table.points.flatten(1), nominal(table.q, theta)
         y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
-        return TangentData(nominal, theta, table.q, y, noise, noise.body_tails(found.tails))
-
-    def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
-        """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
-        weights = self.data.q.new_ones(len(self.data), bodies)
-        if own is not None and self.coordinates is not None:
-            weights[self.coordinates.rows] = own.tails.weights
-        else:
-            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
-        return weights
+        worst = found.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point
+        return TangentData(nominal, theta, table.q, y, noise, replace(found.tails, weights=worst))
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:
@@ -343,7 +335,16 @@ def _by_coordinates(
     own.table.check_every_marker_seen()
     sessions, table = Sessions.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
+    progress("registration", 0, 1)
+    sockets = list[SocketDevices]()
+    if table.sockets is not None:
+        places, table, stages = stages_by_sockets(robot, table)
+        sockets.append(places.of_rows(own.rows, count))
+    else:
+        registration = registered(robot, table)
+        progress("geometry", 0, 1)
+        stages = registration, identify(registration.geometry, table.q, table.points)
+        check_identification(table, stages[1])
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])

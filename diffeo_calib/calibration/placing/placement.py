@@ -169,7 +169,7 @@ class DeviceSet(ABC):
         return []
 
     def entry(self) -> dict[str, object]:
-        """The same for programs, in m and rad."""
+        """Where the devices are, for programs, in m and rad."""
         return {}
 
 
@@ -196,14 +196,12 @@ class Placement(tuple[DeviceSet, ...]):
         return {name: view for own in self for name, view in own.views().items()}
 
     def measured_at(self, row: int, like: T, points: Tensor) -> T:
-        """See :meth:`DeviceSet.measured_at`."""
         views = self.views()
         for own in self:
             like = own.measured_at(row, like, points, views)
         return like
 
     def places_at(self, row: int) -> Tensor | None:
-        """See :meth:`DeviceSet.places_at`."""
         return next((places for own in self if (places := own.places_at(row)) is not None), None)
 
     def shared(self, data: Seen) -> Tensor | None:
@@ -211,11 +209,14 @@ class Placement(tuple[DeviceSet, ...]):
         effects = [own.effects(data) for own in self]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(self, fitted: Fit, around: FittedMap, *at: Tensor, kind: Any = DeviceSet, **known: Any) -> Placement:
+    def settled(
+        self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, kind: Any = DeviceSet, **known: Any
+    ) -> Placement:
         """Those of a kind where a fit puts them, whose last shifts are those of all devices.
 
         Args:
-            fitted: the fit. around: its map, with the covariances of the model. at, known: see :class:`Settled`.
+            fitted: the fit. around: its map, with the covariances of the model.
+            centre, transform, known: see :class:`Settled`.
         """
         sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.size for own in self]
         whole = around.shift_covariance() if len(shifts) else shifts[:, None]
@@ -223,7 +224,7 @@ class Placement(tuple[DeviceSet, ...]):
         for own, part in zip(self, numbers.split(sizes), strict=True):
             if isinstance(own, kind):
                 covariance = whole[part[:, None], part]
-                sets.append(own.settled(Settled(shifts[part], covariance, around, *at, **known)))
+                sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)
 
     def aligned(self, data: T) -> T:
@@ -233,11 +234,9 @@ class Placement(tuple[DeviceSet, ...]):
         return data
 
     def sentences(self) -> list[str]:
-        """Where all devices are."""
         return [line for own in self for line in own.sentences()]
 
     def entry(self) -> dict[str, object]:
-        """The same for programs."""
         found: dict[str, object] = {}
         for own in self:
             found |= own.entry()

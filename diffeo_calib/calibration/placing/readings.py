@@ -70,7 +70,6 @@ class ReadingDevices(DeviceSet):
 
     @property
     def size(self) -> int:
-        """Increments of all devices."""
         return self.devices.freedom
 
     @property
@@ -82,29 +81,26 @@ class ReadingDevices(DeviceSet):
         """(M, 3 k) coordinates of what the devices see, m."""
         return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
 
-    def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`."""
-        own = self.devices.shared(self._seen(data), self.device)
-        found = own.new_zeros(*data.y.shape, own.shape[2])
-        found[self.rows[:, None], self.numbers] = own
+    def _of_all_rows(self, effects: Tensor, data: Seen) -> Tensor:
+        """Effects (M, r, U) on the own rows as those on all (N, R, U)."""
+        found = effects.new_zeros(*data.y.shape, effects.shape[2])
+        found[self.rows[:, None], self.numbers] = effects
         return found
 
+    def effects(self, data: Seen) -> Tensor:
+        return self._of_all_rows(self.devices.shared(self._seen(data), self.device), data)
+
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
-        """See :class:`DeviceSet`: those of the devices, with effects on all rows."""
         for one in self.devices.hypotheses(self._seen(data), self.device):
-            whole = one.effects.new_zeros(*data.y.shape, one.effects.shape[2])
-            whole[self.rows[:, None], self.numbers] = one.effects
-            yield one._replace(effects=whole)
+            yield one._replace(effects=self._of_all_rows(one.effects, data))
 
     def settled(self, found: Settled) -> ReadingDevices:
-        """See :class:`DeviceSet`."""
         devices, shape = self.devices, (len(self.devices.names), -1)
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
         known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
         return replace(self, devices=moved, known=known)
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
-        """See :class:`DeviceSet`."""
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
         self.devices.numbers(own.table)  # refuses other devices
         return replace(self, data=own.table, rows=own.rows)
@@ -116,19 +112,16 @@ class ReadingDevices(DeviceSet):
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:
-        """See :class:`DeviceSet`."""
         known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         prior = self.devices.deviations.expand(len(self.devices.names), -1)
         deviations = prior if self.known is None else self.known
         own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
         return PlacedDevices(self.devices.kind, *own, self.data.shown)
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`."""
         constants = dict(zip(self.devices.names, self.devices.constants.tolist(), strict=True))
         found: dict[str, object] = {"constants": constants}
         if self.known is not None:
@@ -169,8 +162,6 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     held, joints = held_parameters(bare, adrift=True), range(bare.size)[bare.slices["joints"]]
     root, still = Prior().root(bare, held), Prior().root(bare, [*held, *joints])
     poses = [bare.marker_poses(data.q) for data in tables]
-    for data, T in zip(tables, poses, strict=True):
-        kind_of(data).check_unit(data, T[:, 0, :3, :3], T[:, 0, :3, 3])
     found = _rough_fits(bare, still, _starts(bare.tool[0], tables, poses), poses)
     if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
         balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
@@ -194,14 +185,22 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
 def _rough_fits(
     bare: Geometry, root: Tensor, starts: Sequence[tuple[Tensor, list[ReadRows]]], poses: Sequence[Tensor]
 ) -> list[tuple[tuple[float, str], Fit, Rows]]:
-    """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
+    """Ball and devices from each start that leads anywhere, after the largest median residual of a device and its name.
+
+    One wrong plane of three shows in it, m.
+    """
     found = []
     for ball, parts in starts:
         rows = Rows(bare.with_tool(ball[None]), tuple(parts), poses)
         sigma = ball.new_full((sum(len(own.q) for own in parts), 1), ROUGH_M)
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             rough = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
-            found.append((_of_worst_device(parts, rough.errors), rough, rows))
+            worst = max(
+                (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
+                for (data, _), own in zip(parts, rough.errors, strict=True)
+                for number, name in enumerate(data.names)
+            )
+            found.append((worst, rough, rows))
     return found
 
 
@@ -305,15 +304,6 @@ def _moved(rows: Rows, shifts: Tensor) -> tuple[ReadRows, ...]:
     """All rows with their devices after shifts."""
     each = zip(rows.parts, rows.split(shifts), strict=True)
     return tuple(own._replace(devices=own.moved(some)) for own, some in each if isinstance(own, ReadRows))
-
-
-def _of_worst_device(parts: Sequence[ReadRows], errors: Sequence[Tensor]) -> tuple[float, str]:
-    """The largest median residual of a device's readings, m, and its name: one wrong plane of three shows in it."""
-    return max(
-        (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
-        for (data, _), own in zip(parts, errors, strict=True)
-        for number, name in enumerate(data.names)
-    )
 
 
 def _doubt(

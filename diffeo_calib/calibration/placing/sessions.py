@@ -24,6 +24,7 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -98,9 +99,7 @@ class Sessions(DeviceSet):
         geometry = register_inliers(robot, data.largest_session())[0].geometry
         found = cls.around(data, kind, geometry, geometry.points(data.q))
         for _ in range(ROUNDS - 1):  # a better geometry gives better places
-            together = found.aligned(data)
-            start = register(robot, together.q, together.points, marker_tips(robot, data))
-            geometry = identify(start.geometry, together.q, together.points).geometry
+            geometry = _geometry(robot, found.aligned(data))
             found = cls.around(data, kind, geometry, geometry.points(data.q))
         return found
 
@@ -130,7 +129,6 @@ class Sessions(DeviceSet):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the sessions."""
         return self.set_ups.names
 
     @property
@@ -144,7 +142,6 @@ class Sessions(DeviceSet):
         return self.set_ups.aligned(data)
 
     def groups(self) -> list[tuple[str, Tensor]]:
-        """See :class:`DeviceSet`."""
         return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
 
     @property
@@ -173,25 +170,21 @@ class Sessions(DeviceSet):
         return len(self.others) * self.set_ups.increments_each
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`: what is left of the differences."""
         tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
         by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         return self.of_each(self.set_ups.increments(places, data.slopes, by_tool, centre), self.session)
 
     def settled(self, found: Settled) -> Sessions:
-        """See :class:`DeviceSet`."""
         steps, k = found.shifts.view(len(self.others), -1), self.set_ups.deviations.shape[1]
         std = found.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
         moved = self.set_ups.moved(self.others, steps, std, found.centre, found.transform)
         return replace(self, set_ups=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        """See :class:`DeviceSet`."""
         return dict(zip(self.names, self.set_ups.views(), strict=True))
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
-        """See :class:`DeviceSet`."""
         session, points, count = self.session[own.rows], own.table.points, self.markers
         for number, name in enumerate(self.names if self.set_ups.kind == SESSION else ()):
             T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
@@ -200,20 +193,16 @@ class Sessions(DeviceSet):
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         rows, own = (self.session != NO_SOCKET).nonzero()[:, 0], self.set_ups
         return PlacedDevices(own.kind, own.names, own.constants, own.deviations, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
-        """See :class:`DeviceSet`."""
         return {self.set_ups.key: self.set_ups.entry()}
 
     def sentences(self) -> list[str]:
-        """See :class:`DeviceSet`."""
         return self.set_ups.sentences()
 
     def with_rows(self, other: OtherRows) -> Sessions:
-        """See :class:`DeviceSet`."""
         session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
         device = None if other.coordinates is None else measured_rows(other.coordinates.table)
         if other.coordinates is not None and device is not None:
@@ -229,8 +218,7 @@ class Sessions(DeviceSet):
         if unknown:
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        known = [self.names.index(name) if name else NO_SOCKET for name in names]
-        return torch.tensor(known, dtype=torch.int64, device=HOST)
+        return numbers_of(names, self.names)
 
     def of_rows(self, rows: Tensor, count: int) -> Sessions:
         """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
@@ -253,10 +241,15 @@ def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:
             warn_user(sentence(words, fix=fix))
 
 
+def _geometry(robot: Tree, data: Measurements) -> Geometry:
+    """Geometric calibration by all rows."""
+    start = register(robot, data.q, data.points, marker_tips(robot, data))
+    return identify(start.geometry, data.q, data.points).geometry
+
+
 def _largest_median(robot: Tree, data: Measurements, sessions: Sessions) -> float:
     """Median distance of a session's rows from the geometric calibration of all, m: that of the worst session."""
-    points = sessions.aligned(data).points
-    start = register(robot, data.q, points, marker_tips(robot, data))
-    away = (identify(start.geometry, data.q, points).geometry.points(data.q) - points).norm(dim=2)
+    together = sessions.aligned(data)
+    away = (_geometry(robot, together).points(data.q) - together.points).norm(dim=2)
     numbers = sessions.numbers(data)
     return max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())

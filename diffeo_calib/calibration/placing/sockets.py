@@ -38,8 +38,8 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
-from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
@@ -53,7 +53,6 @@ from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -161,25 +160,22 @@ class SocketDevices(DeviceSet):
         return effects
 
     def at_places(self, table: Measurements) -> Measurements:
-        """See :class:`DeviceSet`: the places of their sockets as measured positions of the ball."""
+        """The places of their sockets as measured positions of the ball."""
         table = self.named(table)
         rows, points = table.socket_numbers != NO_SOCKET, table.points.clone()
         points[rows, -1] = self.positions[table.socket_numbers[rows]]
         return with_attributes(table, points=points)
 
     def places_at(self, row: int) -> Tensor | None:
-        """See :class:`DeviceSet`: all sockets."""
         return None if self.socket[row] == NO_SOCKET else self.positions
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """See :class:`DeviceSet`: whether the ball is near a socket."""
         places = self.places_at(row)
         if places is None:
             return super().sees(row, points, views)
         return torch.cdist(points[:, -1], places.to(points)).amin(1) < IN_SOCKET_M
 
     def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """See :class:`DeviceSet`: in the nearest socket."""
         places = self.places_at(row)
         if places is None:
             return like
@@ -188,16 +184,13 @@ class SocketDevices(DeviceSet):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """S names."""
         return self.sockets.names
 
     @property
     def size(self) -> int:
-        """Three of each socket."""
         return self.root.shape[1]
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
-        """See :class:`DeviceSet`: the known distances, the same at all places."""
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.sockets.blocks:
             effects = data.points.new_zeros(*data.points.shape, 1)
@@ -215,12 +208,10 @@ class SocketDevices(DeviceSet):
             )
 
     def effects(self, data: Seen) -> Tensor:
-        """See :class:`DeviceSet`: the errors of the last marker, the ball."""
         effects = self.shared(data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
 
     def settled(self, found: Settled) -> SocketDevices:
-        """See :class:`DeviceSet`."""
         root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
@@ -234,7 +225,6 @@ class SocketDevices(DeviceSet):
         )
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
-        """See :class:`DeviceSet`."""
         socket = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
         if other.coordinates is not None:
             table = self.named(other.coordinates.table)
@@ -246,9 +236,7 @@ class SocketDevices(DeviceSet):
         unknown = sorted(set(table.row_sockets) - {*self.names, ""})
         if unknown:
             raise MeasurementError.of("rows in sockets", expected=few(self.names), got=few(unknown))
-        numbers = {name: number for number, name in enumerate(self.names)} | {"": NO_SOCKET}
-        own = torch.tensor([numbers[name] for name in table.row_sockets], dtype=torch.int64, device=HOST)
-        return with_attributes(table, socket=own, sockets=self.sockets)
+        return with_attributes(table, socket=numbers_of(table.row_sockets, self.names), sockets=self.sockets)
 
     def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
         """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.
@@ -267,7 +255,9 @@ class SocketDevices(DeviceSet):
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
             predicted = data.y[rows, -3:] - errors.view(-1, 3)
-            found.append(PlaceErrors(name, len(rows), *_spread(predicted, self.socket[rows], sockets)))
+            away, distances = socket_errors(predicted, self.socket[rows], sockets)
+            spread = float(away.square().sum(1).mean().sqrt())
+            found.append(PlaceErrors(name, len(rows), spread, tuple(one.error for one in distances)))
         return tuple(found)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
@@ -289,7 +279,6 @@ class SocketDevices(DeviceSet):
         return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
 
     def placed(self) -> PlacedDevices:
-        """See :class:`DeviceSet`."""
         rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
         return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
 
@@ -314,34 +303,6 @@ class SocketDevices(DeviceSet):
             known = f", distance {errors} mm" * bool(errors)
             lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
-
-
-def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float, tuple[float, ...]]:
-    """Spread of predicted positions (N, 3) within sockets, and errors of the known distances, m."""
-    errors = socket_errors(predicted, socket, sockets)
-    return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
-
-
-def coordinate_stages(
-    robot: Tree, own: Coordinates, count: int, progress: Progress
-) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
-    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
-
-    Args:
-        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
-
-    Raises:
-        MeasurementError: rows that cannot belong to this robot, or too few.
-    """
-    progress("registration", 0, 1)
-    if own.table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, own.table)
-        return [places.of_rows(own.rows, count)], table, stages
-    registration = registered(robot, own.table)
-    progress("geometry", 0, 1)
-    identification = identify(registration.geometry, own.table.q, own.table.points)
-    check_identification(own.table, identification)
-    return [], own.table, (registration, identification)
 
 
 def stages_by_sockets(
@@ -370,13 +331,19 @@ def stages_by_sockets(
         registration = start.with_ball(registration)
         tails = Tails.none(len(data), registration.geometry.markers, device=registration.theta.device)
         registration = replace(registration, tails=tails)
-    identification, places = geometry_by_sockets(data, found.positions, registration)
+    geometry, places = registration.geometry, SocketDevices.around(data, found.positions)
+    held = held_parameters(geometry, adrift=start is None)
+    for _ in range(ROUNDS):
+        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
+        identification = identify(geometry, placed.q, placed.points, shared=shared, held=held)
+        ball = identification.geometry.points(resting.q)[:, -1]
+        places = SocketDevices.around(data, socket_means(ball, resting.socket_numbers))
     if device is not None and start is not None:
         seen = identification.geometry  # without the ball, which a device does not see
         seen = seen.with_tool(seen.tool[:-1], seen.on[:-1])
         check_identification(device, replace(identification, geometry=seen))
         warn_of_other_robot(robot, device, start, found)
-    warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
+    warn_of_wrong_sockets(resting, ball)
     return places, places.at_places(data), (registration, identification)
 
 
@@ -386,29 +353,6 @@ def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
         return None
     resting = data.with_sockets_of_rows().socket_rows()
     return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
-
-
-def _ball(geometry: Geometry, data: Measurements) -> Tensor:
-    """Places (N, 3) of the ball, m."""
-    return geometry.points(data.q)[:, -1]
-
-
-def geometry_by_sockets(
-    data: Measurements, positions: Tensor, registration: Identification
-) -> tuple[Identification, SocketDevices]:
-    """Geometric calibration, and the places of the sockets around it.
-
-    Args:
-        data: rows with sockets. positions: (S, 3) of the registration [m].
-    """
-    geometry, resting = registration.geometry, data.socket_rows()
-    held = held_parameters(geometry, adrift=data.without_device)
-    places = SocketDevices.around(data, positions)
-    for _ in range(ROUNDS):
-        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
-        found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
-        places = SocketDevices.around(data, socket_means(_ball(found.geometry, resting), resting.socket_numbers))
-    return found, places
 
 
 def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:

@@ -19,7 +19,7 @@ from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, Tange
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails, gross_weights, reweight, weighed
+from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.regions import region_factor
 
 BLOCK_COORDINATES = KEPT_COORDINATES
@@ -78,16 +78,18 @@ def estimate_tails(
 ) -> Tails:
     """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
 
+    Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
+
     Args:
         data: the measurements. scales: held fixed. seed: draws the blocks.
         rounds: largest number of steps.
         block_coordinates: largest number of measured coordinates of a block.
     """
     data = data.told
-    blocks, tails = list(_parts(data, seed, block_coordinates)), data.tails
+    tails = data.tails
     for _ in range(rounds):
         squares = torch.empty_like(tails.weights)
-        for rows, part in blocks:
+        for rows, part in _parts(data, seed, block_coordinates):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
         before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
@@ -105,28 +107,6 @@ def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed:
         if _settled(before, tails):
             break
     return tails
-
-
-def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
-    """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
-
-    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
-    weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
-    """
-    data = data.told
-    squares = torch.empty_like(data.tails.weights)
-    blocks = random_blocks(data, seed, BLOCK_COORDINATES)
-    for rows in blocks:
-        squares[rows] = _expected_squares(data.rows(rows), scales, data.tails.rows(rows))
-    first = reweight(squares, data.noise_model.freedom)
-    for rows in blocks if first.freedom < inf else ():
-        part, tails = data.rows(rows), first.rows(rows)
-        for _ in range(ROUNDS - 1):
-            squares[rows] = _expected_squares(part, scales, tails)
-            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
-            if _settled(before, tails):
-                break
-    return _among_gross(data, scales, reweight(squares, data.noise_model.freedom), seed)
 
 
 def _settled(before: Tails, after: Tails) -> bool:

@@ -214,10 +214,6 @@ class NoiseModel:
         per_number = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
         return per_number[:, :, None] * covariance * per_number[:, None, :]
 
-    def body_tails(self, tails: Tails) -> Tails:
-        """The tails of points as those of bodies: a pose is as wrong as its worst point."""
-        return replace(tails, weights=tails.weights.unflatten(1, (self.bodies, -1)).amin(2))
-
     def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
         """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, R, R).
 
@@ -262,7 +258,8 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
         return data
     predicted = poses_from_marks(found.geometry.points(data.q), seen.lever)
     turned = S.mT - predicted[:, :3, :3].mT  # R_i - R^_i
-    away = seen.board - (inverse_poses(predicted) @ _homogeneous(origins[0]))[:, :3]
+    towards = inverse_poses(predicted)
+    away = seen.board - towards[:, :3, :3] @ origins[0] - towards[:, :3, 3]
     weights = found.tails.weights.amin(1)
     size = float((weights * away.square().mean(1)).sum() / weights.sum())
     eye = torch.eye(3, dtype=away.dtype, device=away.device)
@@ -271,7 +268,3 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
     point[:2] = torch.linalg.solve(normal[:2, :2], push[:2])
     LOG.info("the board is seen best at %s mm from its origin", [round(v, 1) for v in (1e3 * point).tolist()])
     return with_attributes(data, board=seen.board + (S.mT @ point))
-
-
-def _homogeneous(point: torch.Tensor) -> torch.Tensor:
-    return torch.cat([point, torch.ones_like(point[:1])])

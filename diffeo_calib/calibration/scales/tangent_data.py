@@ -161,7 +161,7 @@ class TangentData:
         to = basis.mT
         shared = None if self.shared is None else to @ self.shared
         numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
-        observe, nominal = LinearFunctionals(to, to.new_zeros(to.shape[:2])), self.nominal.with_rigid_frames()
+        observe, nominal = LinearFunctionals(to), self.nominal.with_rigid_frames()
         other = replace(self, **numbers, observe=observe, nominal=nominal)
         vars(other).update(points=self.points, jacobian=to @ self.jacobian)
         return other
@@ -239,10 +239,6 @@ class TangentData:
         other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
         vars(other).pop("sensitivities", None)
         return other
-
-    def with_measured(self, y: Tensor) -> TangentData:
-        """The same configurations with other measured coordinates (N, m), m."""
-        return self._variant(y=y)
 
     def _variant(self, share: Callable[[Tensor], Tensor] = lambda values: values, **changes: Any) -> TangentData:
         """A copy with changes, which takes over its share of the cached properties."""

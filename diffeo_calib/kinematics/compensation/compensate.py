@@ -318,19 +318,15 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
         rows = np.flatnonzero((np.abs(slow - q) > SAME_CORRECTION_TOLERANCE).any(1))
         if not len(rows):
             break
-        q[rows] = _with_held_joints(problem.take(rows), slow[rows], held[rows])
+        part, still = problem.take(rows), held[rows]
+        box = part.box()
+        at = np.clip(slow[rows], box.low, box.high)
+        box = Box(box.start, np.where(still, at, box.low), np.where(still, at, box.high), box.mobility * ~still)
+        q[rows] = box_search(part.tool, part.targets, at, box)[0]
     slow = start + pace.limited(q - start, firm)
     q = np.where(np.abs(slow - q) > ROUNDING, slow, q)
     box = problem.box()
     return problem.keep_mimics(_judged(problem, found, np.clip(q, box.low, box.high))), jumps
-
-
-def _with_held_joints(problem: CompensationProblem, q: Array, held: Array) -> Array:
-    """The nearest commands (R, n) with some joints held (R, n)."""
-    box = problem.box()
-    q = np.clip(q, box.low, box.high)
-    box = Box(box.start, np.where(held, q, box.low), np.where(held, q, box.high), box.mobility * ~held)
-    return box_search(problem.tool, problem.targets, q, box)[0]
 
 
 def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solution:

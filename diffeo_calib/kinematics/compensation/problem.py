@@ -72,14 +72,12 @@ class CompensationProblem:
         possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
-            for whole, part in zip(found, self.take(rows)._solve(), strict=True):
+            own, box = self.take(rows), self.box(rows)
+            q, seen, done = own.search(box, np.clip(box.start, box.low, box.high))
+            solved = own.keep_mimics(Solution(q, seen, own._codes(q, seen, done)))
+            for whole, part in zip(found, solved, strict=True):
                 whole[rows] = part
         return found
-
-    def _solve(self) -> Solution:
-        box = self.box()
-        q, poses, done = self.search(box, np.clip(box.start, box.low, box.high))
-        return self.keep_mimics(Solution(q, poses, self._codes(q, poses, done)))
 
     def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:
         """The fast search from ``q`` (N, n), and the careful one for the rows that it gives up."""

@@ -81,21 +81,16 @@ def _together(new: NewDate) -> tuple[Tensor, Tensor, Observation | None]:
         return torch.cat([old.measured(), new.y]), torch.cat([old.noise.covariance, own_noise]), None
     A, y = old.linearised_rows()
     (N, r, m), (M, own) = A.shape, new.y.shape
-    size, whole = max(r, own), torch.arange(m, device=y.device)
-    parts = [Part(torch.arange(N, device=y.device), whole, whole.new_tensor(range(r)), _linear(A))]
+    size, rows = max(r, own), torch.arange(N + M, device=y.device)
+    parts = [Part(rows[:N], torch.arange(m, device=y.device), torch.arange(r, device=y.device), LinearFunctionals(A))]
     if isinstance(new.observe, Stacked):
         parts += [Part(part.rows + N, part.points, part.numbers, part.observe) for part in new.observe.parts]
     else:
-        eye = torch.eye(own, dtype=y.dtype, device=y.device).expand(M, -1, -1)
-        parts.append(Part(torch.arange(N, N + M, device=y.device), whole[:own], whole[:own], _linear(eye)))
+        parts.append(Part.of_coordinates(rows[N:], own))
     noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, own_noise)]
     seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
     numbers = torch.cat([pad(values, (0, size - values.shape[1])) for values in (y, new.y)])
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
-
-
-def _linear(A: Tensor) -> LinearFunctionals:
-    return LinearFunctionals(A, A.new_zeros(A.shape[:2]))
 
 
 def _shared(nominal: GeometryMap, new: NewDate, drifted: list[Tensor]) -> Tensor:

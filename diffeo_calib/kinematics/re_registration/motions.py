@@ -12,6 +12,7 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -74,8 +75,7 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
     T = rigid_fit(predicted.flatten(0, 1), measured.flatten(0, 1))
     left = measured - predicted @ T[:3, :3].mT - T[:3, 3]
     shift = float((measured - predicted).nanmean((0, 1)).norm())
-    skewed = T[:3, :3] - T[:3, :3].mT
-    turn = float(torch.atan2(skewed.norm() / 8**0.5, (T[:3, :3].trace() - 1) / 2))
+    turn = float(angle_between(torch.eye(3, dtype=T.dtype, device=T.device), T[:3, :3]))
     return Motion("the measuring device", shift, turn, _explained(measured - predicted, left, 6), left)
 
 

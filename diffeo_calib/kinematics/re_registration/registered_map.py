@@ -302,17 +302,15 @@ def turned(covariance: Tensor, R: Tensor) -> Tensor:
 def check_isotropic(kernel: Kernel) -> None:
     """Raise InputError unless a kernel on R^3 is the same in all directions."""
     for term in kernel.terms:
-        if not (isinstance(term, RadialKernel) and _isotropic(term)):
+        same = False
+        if isinstance(term, RadialKernel) and term.columns is None and term.output is None:
+            periodic = [term.periodic] if isinstance(term.periodic, bool) else term.periodic
+            scales = term.lengthscale, term.variance
+            same = not any(periodic) and all(bool((scale == scale.flatten()[0]).all()) for scale in scales)
+        if not same:
             what = f"the task kernel of this model ({term!r}) is not the same in all directions"
             fix = "fit again in the new frame, or with a task kernel of one length scale and one variance"
             raise InputError.of(f"{what}: the model cannot be moved to another frame", fix=fix)
-
-
-def _isotropic(kernel: RadialKernel) -> bool:
-    periodic = kernel.periodic if isinstance(kernel.periodic, bool) else any(kernel.periodic)
-    scales = (kernel.lengthscale, kernel.variance)
-    same = all(bool((scale == scale.flatten()[0]).all()) for scale in scales)
-    return same and not periodic and kernel.columns is None and kernel.output is None
 
 
 WELL_KNOWN_M = 1e-4
