@@ -1,7 +1,7 @@
 """`compare`: what has changed between a model and new rows, or between two models of one robot.
 
-Another model is tested as rows are: what it predicts of the markers at configurations of its own fit is what was
-measured, and its errors there, which these rows share, are a drift of unit size.
+Another model is tested as rows are: what it predicts of the markers at configurations of the fits is what was measured,
+and its errors there, which these rows share, are a drift of unit size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
+from diffeo_calib.calibration.recalibration.changes import FEWEST_ROWS, LEVEL, Changes, find_changes
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
@@ -36,9 +36,7 @@ from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.sensors.errors import Evaluations
 
 MOST_PREDICTED = 60
-"""Configurations of the fit of another model at which it is compared."""
-PREDICTED_NOISE_M = 5e-6
-"""Independent deviation of each coordinate that a model predicts, beside its errors."""
+"""Configurations of two fits at which the models are compared."""
 MOST_USUAL = 100
 """Rows of the fit that show how certain a model is there."""
 UNKNOWN_PER_USUAL = 5.0
@@ -47,7 +45,7 @@ UNKNOWN_PER_USUAL = 5.0
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """A model and new rows of its robot.
+    """A model and new rows of its robot, or what another model predicts of it.
 
     Args:
         moved: where measuring device and markers are now; None where no device measured coordinates.
@@ -78,7 +76,8 @@ class Comparison:
 
     def __str__(self) -> str:
         if self.telling or self.changes.found:
-            return "; ".join(map(str, self.hidden)) if self.hidden and not self.changes.found else str(self.changes)
+            words = "; ".join(map(str, self.hidden)) if self.hidden and not self.changes.found else str(self.changes)
+            return words_of_mass(self.payload) + words
         return (
             "these rows cannot tell whether anything has changed: the old model expects errors of them "
             f"({self.expectations.rms_text}) far above those at the rows of its fit ({self.usual.rms_text}); measure "
@@ -119,24 +118,28 @@ def compare(
     """
     check_seed(seed)
     check_number(level, "`level`", above=0.0, below=1.0)
-    payload = None
-    if isinstance(other, CalibratedKinematics):
-        payload = common_mass(model.payload, other.payload)
-        model, marker = under_mass(model, payload).to(HOST), "other"
-        rows = _predicted_rows(model, under_mass(other, payload).to(HOST))
-    else:
+    measured, payload = not isinstance(other, CalibratedKinematics), None
+    if measured:
         check_arguments(model, other, marker)
         rows = weighed(place_again(model, other, marker), marker)
+    else:
+        payload = common_mass(model.payload, other.payload)
+        model = under_mass(model, payload).to(HOST)
+        rows = _predicted_rows(model, under_mass(other, payload).to(HOST))
     changes, _ = find_changes(rows, level=level, seed=seed)
-    measured = not isinstance(other, CalibratedKinematics)
     if measured:
         warn_of_places(rows.before, marker, outliers=not changes.found, excess=not changes.found)
     usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
     usual = usual.masked_fill(~rows.visible, nan)
-    errors, expected, usual = map(rows.by_kind, (rows.placed_residual, rows.expected_residual, usual))
-    found = rows.before.registration if measured else None
-    hidden = hidden_offsets(model.robot, rows.before, changes) if measured else ()
-    return Comparison(found, changes, errors, expected, usual, hidden, payload)
+    return Comparison(
+        moved=rows.before.registration if measured else None,
+        changes=changes,
+        errors=rows.by_kind(rows.placed_residual),
+        expectations=rows.by_kind(rows.expected_residual),
+        usual=rows.by_kind(usual),
+        hidden=hidden_offsets(model.robot, rows.before, changes) if measured else (),
+        payload=payload,
+    )
 
 
 def _usual_deviation(model: CalibratedKinematics) -> float:
@@ -147,20 +150,27 @@ def _usual_deviation(model: CalibratedKinematics) -> float:
 
 
 def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> NewRows:
-    """What another model predicts of the markers of a model, at configurations of its own fit."""
+    """What another model predicts of the markers of a model, at configurations of both fits that both know."""
     if model.robot.joint_names != other.robot.joint_names:
         expected, got = ", ".join(model.robot.joint_names), ", ".join(other.robot.joint_names)
         raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
-    q = other.configurations
+    fits = other.configurations, model.configurations
+    low = torch.maximum(*(own.amin(0) for own in fits))
+    high = torch.minimum(*(own.amax(0) for own in fits))
+    q = torch.cat(fits)
+    q = q[((q >= low) & (q <= high)).all(1)]
+    if len(q) < FEWEST_ROWS:
+        fix = "compare a model with measurements"
+        raise InputError.of("the models hardly have configurations in common", fix=fix)
     q = q[:: -(-len(q) // MOST_PREDICTED)]
-    there = Measurements.of_points(q, model(q).detach(), model.on, model.lever).with_load(model.nominal.load)
+
+    def measured(points: Tensor) -> Measurements:
+        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(model.nominal.load)
+
     fitted = other.map.unregistered
-    found = find_place(fitted, other.nominal, other.lever, there).registration
+    found = find_place(fitted, other.nominal, other.lever, measured(model(q))).registration
     placed = RegisteredMap(moved(fitted, found.transform), found)
-    points = placed(q).detach().unflatten(1, (-1, 3))
-    data = Measurements.of_points(q, points, model.on, model.lever).with_load(model.nominal.load)
-    rows = weighed(place_again(model, data, "other"), "other")
-    noise = PREDICTED_NOISE_M**2 * torch.eye(rows.noise.shape[1], dtype=q.dtype, device=q.device)
+    rows = weighed(place_again(model, measured(placed(q).unflatten(1, (-1, 3))), "other"), "other")
     values, vectors = torch.linalg.eigh(FittedMap.joint_covariance(placed, q))
-    root = vectors * values.clamp(min=0.0).sqrt()
-    return rows.changed(noise=noise.expand_as(rows.noise)).if_drifting([root.unflatten(0, (len(q), -1))])
+    errors = vectors * values.clamp(min=0.0).sqrt()
+    return rows.if_drifting([errors.unflatten(0, (len(q), -1))])

@@ -1,8 +1,4 @@
-"""Joint offsets between two calibrations, and those that a moved device or marker would hide.
-
-Two models differ over the workspace, with a covariance in which the places of device and markers are unknown; every
-offset is a hypothesis. An offset whose motion these places reproduce is not named: they hide it.
-"""
+"""Joint offsets that a moved device or marker would hide."""
 
 from __future__ import annotations
 
@@ -13,22 +9,16 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.common.errors import with_deviation
-from diffeo_calib.common.quantiles import chi2_above, chi2_probability
-from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 
-FLOOR_M = 5e-6
-"""Deviation of each coordinate of a difference of models, beside what both expect."""
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
-SMALLEST_CHANCE = 1e-6
-"""That is stated: the models' covariances are no better known."""
 PRISMATIC = "prismatic"
 
 
