@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.planning.sensors import Sensor
-    from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
+    from diffeo_calib.calibration.recalibration.compare import Comparison, compare
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
     from diffeo_calib.campaign.campaign import Campaign
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
@@ -81,7 +81,6 @@ __all__ = [
     "Kernel",
     "Matern",
     "Measurements",
-    "ModelComparison",
     "Observations",
     "PerJoint",
     "Plan",
@@ -123,7 +122,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "calibration.planning.candidates": "Tracker candidates",
             "calibration.planning.plan": "Plan plan",
             "calibration.planning.sensors": "Sensor",
-            "calibration.recalibration.compare": "Comparison ModelComparison compare",
+            "calibration.recalibration.compare": "Comparison compare",
             "calibration.recalibration.recalibrate": "Recalibration recalibrate",
             "process.scales": "Hyperparameters",
             "campaign.campaign": "Campaign",

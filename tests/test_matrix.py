@@ -47,6 +47,8 @@ NEW_ROWS_FACTOR = 1.6
 """A model of fewer or of newly placed rows may be worse than that of the fit by this factor."""
 EXPECTED_FACTOR = 2.5
 """Largest error per error that the model expects."""
+TOO_SURE = {"camera on the tool"}
+"""Kinds whose fits hang on a few of 24 images, by heavy tails, and differ by more than they claim."""
 
 
 WHAT = {
@@ -367,7 +369,8 @@ def _(bench: Bench) -> None:
 @verb("compare two models")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    found: Any = dc.compare(kind.model, kind.of_part.model, count=100)
+    found: Any = dc.compare(kind.model, kind.of_part.model)
+    assert not found.changes.found or kind.name in TOO_SURE
     assert 0.0 < found.rms < EXPECTED_FACTOR * found.expected
 
 

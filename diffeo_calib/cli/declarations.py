@@ -407,10 +407,10 @@ class CompareOptions(Command):
     """Say what has changed since a calibration.
 
     With a table: a test for every joint, the load and the geometry. It is read as that of the old fit, unless options
-    say otherwise. With a model: how far the two differ over the joint ranges that both know, beside what their
-    uncertainties explain. An offset is added to what the joint reads: after a change by +0.5 mrad the joint stands
-    0.5 mrad farther in its positive direction than the old model has it at the same reading. The exit code is 0 whether
-    or not something has changed: with --json, programs read `changes` and `rows_can_tell`.
+    say otherwise. With a model: the same test of what it predicts at rows of the fits, with its uncertainty. An
+    offset is added to what the joint reads: after a change by +0.5 mrad the joint stands 0.5 mrad farther in its
+    positive direction than the old model has it at the same reading. The exit code is 0 whether or not something has
+    changed: with --json, programs read `changes` and `rows_can_tell`.
     """
 
     old: Path = argument("OLD", "Model file of an earlier calibration.")

@@ -58,48 +58,55 @@ class _Seen(NamedTuple):
     sensitivity: Tensor | None
 
 
-class _Device(NamedTuple):
-    """One of a set of devices.
+class FittedDevice(NamedTuple):
+    """A device of readings beside a fit, where the model has it.
 
     Args:
-        devices, number: the set, and its number there. deviations: (k,) of its unknowns: by the prior of the fit if it
-            measured rows of the fit, else by the rows on which it was placed.
-        columns: (c,) boolean, its unknowns among the shifts of the fit. noise: (r, r) of a reading, m^2. Both None for
-            a device that measured no row of the fit.
+        devices: it alone, with the standard deviations of its k unknowns after the rows on which it was placed.
+        columns: (c,) boolean, its unknowns among the shifts of the fit; None for a device that measured no row of the
+            fit, or of a model that was moved since.
+        root: (k, k) root of the prior covariance of its unknowns, in the order of these columns; without them of the
+            covariance by the rows on which it was placed.
+        noise: (r, r) of a reading by its rows of the fit, m^2; None without any.
     """
 
     devices: Devices
-    number: int
-    deviations: Tensor
+    root: Tensor
     columns: Tensor | None = None
     noise: Tensor | None = None
 
     @classmethod
-    def of(cls, fitted: FittedMap, own: PlacedDevices, devices: Devices, number: int) -> _Device:
-        """By its rows in the fit, unless the model was moved since."""
-        rows, placed = own.rows[own.device == number], cls(devices, number, own.deviations[number])
-        if not len(rows) or fitted.registration is not None or fitted.slopes is None:
+    def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
+        """A device of a set of those of readings."""
+        kind: Any = type(own.devices)
+        deviations = own.deviations[number]
+        devices: Devices = kind(own.names[number : number + 1], own.constants[number, None], deviations)
+        placed, rows = cls(devices, torch.diag(deviations)), own.rows[own.device == number]
+        if not len(rows):
             return placed
-        numbers = fitted.noise.visible[rows][0]
-        effects = fitted.noise.shared[rows][:, numbers]  # (M, r, c)
-        columns = (effects != 0).any(1).any(0)
-        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3 * devices.seen_points :])
-        if int(columns.sum()) != slopes.shape[2]:
+        numbers, shared = fitted.noise.visible[rows][0], fitted.noise.shared[rows]
+        placed = placed._replace(noise=fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values)
+        columns = (shared != 0).any(1).any(0)
+        if fitted.registration is not None or fitted.slopes is None or int(columns.sum()) != len(deviations):
             return placed
-        deviations = (effects[..., columns].square().sum((0, 1)) / slopes.square().sum((0, 1))).sqrt()
-        noise = fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values
-        return cls(devices, number, deviations, columns, noise)
+        slopes = placed.observation(len(rows)).by_constants(devices.points_of(_points(fitted.fitted_points[rows])))
+        effects = shared[:, numbers][..., columns]
+        root = torch.linalg.lstsq(slopes.flatten(0, 1), effects.flatten(0, 1), driver="gelsd").solution
+        return placed._replace(columns=columns, root=root)
 
     def observation(self, rows: int) -> Observation:
         """Its observation for a number of rows, m."""
-        return self.devices.observation(torch.full((rows,), self.number, dtype=torch.int64, device=HOST))
+        return self.devices.observation(torch.zeros(rows, dtype=torch.int64, device=HOST))
+
+    def shared(self, points: Tensor) -> Tensor:
+        """(N, r, k) effects of its unknowns of unit variance on readings of points (N, 3 P'), which it sees, m."""
+        return self.observation(len(points)).by_constants(points) @ self.root
 
     def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
         """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        width, observation = 3 * self.devices.seen_points, self.observation(len(seen.points))
-        points = seen.points[:, -width:]
-        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - width, 0))
-        B = observation.by_constants(points) * self.deviations
+        points, observation = self.devices.points_of(_points(seen.points)), self.observation(len(seen.points))
+        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - points.shape[1], 0))
+        B = self.shared(points)
         if self.columns is None:
             covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
         else:
@@ -110,6 +117,11 @@ class _Device(NamedTuple):
         if noise:
             covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
         return observation.value(points), covariance
+
+
+def _points(coordinates: Tensor) -> Tensor:
+    """(N, P, 3) points by their coordinates (N, 3 P)."""
+    return coordinates.unflatten(1, (-1, 3))
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
@@ -130,7 +142,7 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     for own, devices in sets:
         unit, scale, zero = own.shown_as
         for number, name in enumerate(own.names):
-            device = _Device.of(fitted, own, devices, number)
+            device = FittedDevice.of(fitted, own, number)
             means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)
             factor = q.new_tensor(scale) / devices.metres[number]
             mean = torch.cat(means) * factor + q.new_tensor(zero)

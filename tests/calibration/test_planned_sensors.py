@@ -199,9 +199,10 @@ def test_devices_of_new_rows_are_found_again(name: str) -> None:
     first, shared = len(kind.data), model.map.noise.shared
     for sensor in sensor_of(model):
         assert isinstance(sensor, DeviceReadings)
-        assert sensor.columns is not None
+        assert sensor.fitted is not None
+        assert sensor.fitted.columns is not None
         mine = [k for k, own in enumerate(kind.new.device_names) if own == sensor.devices.names[0]]
-        assert torch.equal(sensor.columns, (shared[[first + k for k in mine]] != 0).any(1).any(0))
+        assert torch.equal(sensor.fitted.columns, (shared[[first + k for k in mine]] != 0).any(1).any(0))
 
 
 @pytest.mark.slow

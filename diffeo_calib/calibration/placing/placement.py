@@ -209,10 +209,8 @@ class Placement(tuple[DeviceSet, ...]):
         effects = [own.effects(data) for own in self]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(
-        self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, kind: Any = DeviceSet, **known: Any
-    ) -> Placement:
-        """Those of a kind where a fit puts them, whose last shifts are those of all devices.
+    def settled(self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, **known: Any) -> Placement:
+        """All devices where a fit puts them, whose last shifts are theirs.
 
         Args:
             fitted: the fit. around: its map, with the covariances of the model.
@@ -222,9 +220,8 @@ class Placement(tuple[DeviceSet, ...]):
         whole = around.shift_covariance() if len(shifts) else shifts[:, None]
         numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
         for own, part in zip(self, numbers.split(sizes), strict=True):
-            if isinstance(own, kind):
-                covariance = whole[part[:, None], part]
-                sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
+            covariance = whole[part[:, None], part]
+            sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)
 
     def aligned(self, data: T) -> T:

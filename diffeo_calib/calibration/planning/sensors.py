@@ -19,6 +19,7 @@ from diffeo_calib.calibration.planning.candidates import Criterion
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.device_readings import FittedDevice
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
@@ -264,16 +265,11 @@ class DeviceReadings(Sensor):
 
     Args:
         devices: where they are, in the robot's base frame.
-        columns: (c0,) boolean, the shifts of the fit that are theirs; None for new devices. The devices of a fit are in
-            the frame of the model's positions.
-        noise: (r, r) of a reading by rows of the fit, m^2; None where there are none.
-        around: whether these new devices are in that frame too: they were placed around the model since.
+        fitted: what a fit knows of the only one, which is in the frame of the model's positions; None for new devices.
     """
 
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
-    columns: Tensor | None = None
-    noise: Tensor | None = None
-    around: bool = False
+    fitted: FittedDevice | None = None
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -294,8 +290,8 @@ class DeviceReadings(Sensor):
 
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the tool."""
-        in_base = self.columns is None and not self.around
-        base = scene.base if in_base else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
+        columns = None if self.fitted is None else self.fitted.columns
+        base = scene.base if self.fitted is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
         last = scene.seen_by(self.devices)
         points = (scene.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]
         points, turn = (points @ base[:3, :3]).flatten(1), torch.block_diag(*[base[:3, :3].mT] * points.shape[1])
@@ -305,18 +301,17 @@ class DeviceReadings(Sensor):
         seen = self.devices.sees(points[rows], device)
         rows, device = rows[seen], device[seen]
         slopes = self.devices.observation(device).slope(points[rows]) @ turn @ last
-        own = self.devices.shared(points[rows], device)
-        if self.columns is None:
-            shared = self._new(scene, own)
+        if self.fitted is None or columns is None:
+            shared = self._new(scene, self.devices.shared(points[rows], device))
         else:
-            shared = own.new_zeros(*own.shape[:2], scene.shifts)
-            shared[..., self.columns] = own
+            shared = slopes.new_zeros(*slopes.shape[:2], scene.shifts)
+            shared[..., columns] = self.fitted.shared(points[rows])
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
 
     def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
         """Covariance (O, r, r) of readings, m^2."""
-        if self.std is None and self.noise is not None:
-            return self.noise.expand(len(rows), -1, -1)
+        if self.std is None and self.fitted is not None and self.fitted.noise is not None:
+            return self.fitted.noise.expand(len(rows), -1, -1)
         return super()._noise(scene, rows, slopes)
 
 

@@ -137,6 +137,7 @@ class NewRows(NewDate):
             return self
         own: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "visible", "shared")}
         own |= {"noise_model": self.noise_model.rows(index), "tails": self.tails.rows(index)}
+        own["drifts"] = None if self.drifts is None else self.drifts.unflatten(0, self.y.shape)[index].flatten(0, 1)
         other = replace(self, **own, observe=None if self.observe is None else self.observe.rows(index))
         points, at = self.seen
         vars(other).update(seen=(points[index], at.rows(index)), by_places=self.by_places[index])

@@ -1,8 +1,4 @@
-"""Joint offsets between two calibrations, and those that a moved device or marker would hide.
-
-Two models differ over the workspace, with a covariance in which the places of device and markers are unknown; every
-offset is a hypothesis. An offset whose motion these places reproduce is not named: they hide it.
-"""
+"""Joint offsets that a moved device or marker would hide."""
 
 from __future__ import annotations
 
@@ -13,22 +9,16 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.common.errors import with_deviation
-from diffeo_calib.common.quantiles import chi2_above, chi2_probability
-from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 
-FLOOR_M = 5e-6
-"""Deviation of each coordinate of a difference of models, beside what both expect."""
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
-SMALLEST_CHANCE = 1e-6
-"""That is stated: the models' covariances are no better known."""
 PRISMATIC = "prismatic"
 
 
@@ -109,43 +99,3 @@ def _motion(found: Registration) -> Tensor:
 def _slopes(placed: RegisteredMap, q: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of the points at q by places (M m, 6 + 3 P) and by joint offsets (M m, n)."""
     return placed.place_slopes(q), placed.geodesic.linearise(q).joint_to_start.flatten(0, 1)
-
-
-def changed_offsets(robot: Tree, first: FittedMap, placed: RegisteredMap, q: Tensor, difference: Tensor) -> Changes:
-    """Offsets that have changed from one model to another.
-
-    Args:
-        robot: with n joints. first: a map. placed: the other one in its place. q: (M, n) some configurations.
-        difference: (M, 3 P) of the points there, other minus first, m.
-    """
-    S, J = _slopes(placed, q)
-    K = first.joint_covariance(q) + FittedMap.joint_covariance(placed, q) + PLACES.session_m_rad**2 * S @ S.mT
-    K = K + FLOOR_M**2 * torch.eye(len(K), dtype=K.dtype, device=K.device)
-    d, changes, first_seen, shown = difference.flatten(), [], {}, J - S @ torch.linalg.lstsq(S, J).solution
-    left = list(range(robot.n))
-    while left:
-        factor = torch.linalg.cholesky(K)
-        each = {k: Evidence.by(J[:, k, None], d, factor) for k in left}
-        ratios = {k: float(one.gain) / one.excess for k, one in each.items()}
-        chances = {k: chi2_probability(ratio, 1) * robot.n for k, ratio in ratios.items()}
-        first_seen = first_seen or {robot.joint_names[k]: chance for k, chance in chances.items()}
-        joint = max(ratios, key=lambda k: ratios[k])
-        if chances[joint] > LEVEL:
-            break
-        best = each[joint]
-        size, deviation = float(best.size), (best.excess / float(best.H)) ** 0.5
-        least = ratios[joint] - gates.OFFSETS_TOLD_APART
-        changes.append(
-            Change(
-                f"the offset of {robot.joint_names[joint]}",
-                size,
-                robot.kinds[joint] != PRISMATIC,
-                abs(size) * float(shown[:, joint].square().mean().sqrt()) * 3**0.5,
-                max(chances[joint], SMALLEST_CHANCE),
-                deviation,
-                tuple(f"the offset of {robot.joint_names[k]}" for k in left if k != joint and ratios[k] > least),
-            )
-        )
-        left.remove(joint)
-        K = K + size**2 * J[:, joint, None] @ J[:, joint, None].mT
-    return Changes(tuple(changes), first_seen, 1.0, len(q), LEVEL)

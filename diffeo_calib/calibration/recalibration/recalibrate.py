@@ -18,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.changes import Drift as PartDrift
@@ -240,13 +239,15 @@ def _result(
 def _with_settled(
     placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: Before, rows: NewRows, fitted: Fit
 ) -> tuple[PlacedDevices, ...]:
-    """The devices, set-ups where the fit puts them."""
-    first = len(fitted.problem.y) - len(rows)
+    """The devices with the new rows that each measured, set-ups where the fit puts them."""
+    first, found = len(fitted.problem.y) - len(rows), list(placement)
     at = fitted.model, rows.centre, place.transform
-    found = rows.placement.settled(fitted, *at, kind=Sessions, known=mounted_of(model))
-    each = [own.placed() for own in found if isinstance(own, Sessions)]
-    settled = {own.kind: replace(own, rows=own.rows + first) for own in each}
-    return tuple(settled[own.kind].beside(own) if own.kind in settled else own for own in placement)
+    for one in rows.placement.settled(fitted, *at, known=mounted_of(model)).placed():
+        own = replace(one, rows=one.rows + first)
+        for number, other in enumerate(found):
+            if own.same_set(other):
+                found[number] = own.beside(other) if own.set_ups is not None else other.with_rows_of(own)
+    return tuple(found)
 
 
 def _ball_measured(before: Before) -> bool:

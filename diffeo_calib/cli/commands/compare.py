@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from math import degrees
 from pathlib import Path
+from typing import Any
 
-from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
+from diffeo_calib.calibration.recalibration.compare import compare
 from diffeo_calib.cli.commands.recalibrate import change_entries, change_lines, doubt, smallest_lines
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import CompareOptions
@@ -26,18 +26,18 @@ def is_model(path: Path) -> bool:
 
 def run(given: CompareOptions) -> None:
     """Compare a model with new measurements, or with another model."""
-    if is_model(given.other):
+    model, other = load_kinematics(given.old), given.other
+    if is_model(other):
         if given.rows.named or given.units.length or given.units.angle:
             fix = "leave out the options of tables, or name a table"
-            raise InputError.of(f"{given.other} is a model, beside options of a table", fix=fix)
-        return _models(given.old, given.other, given.tests.seed)
-    model = load_kinematics(given.old)
-    source = table_of(model, given.other, given.rows, given.units)
-    say(*provenance_lines(model), *another_date_lines(model))
-    how = {"marker": given.tests.marker_freedom, "seed": given.tests.seed}
-    found = compare(model, source.read(model.robot), **how)
-    if not isinstance(found, Comparison):
-        return None
+            raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
+        rows: Any = load_kinematics(other)
+        say(*provenance_lines(model), *provenance_lines(rows))
+    else:
+        source = table_of(model, other, given.rows, given.units)
+        say(*provenance_lines(model), *another_date_lines(model))
+        rows = source.read(model.robot)
+    found = compare(model, rows, marker=given.tests.marker_freedom, seed=given.tests.seed)
     record.add(
         **change_entries(found.changes, found.hidden),
         rows_can_tell=found.telling and found.changes.tested,
@@ -51,28 +51,3 @@ def run(given: CompareOptions) -> None:
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}")
     say(*(change_lines(found.changes) if found.changes.found else [str(found), *smallest_lines(found.changes)]))
-
-
-def _models(old: Path, other: Path, seed: int) -> None:
-    """Compare two models."""
-    models = [load_kinematics(path) for path in (old, other)]
-    for model in models:
-        say(*provenance_lines(model))
-    found = compare(models[0], models[1], seed=seed)
-    if not isinstance(found, ModelComparison):
-        return
-    record.add(
-        rms_m=found.rms,
-        expected_m=found.expected,
-        largest_m=found.largest,
-        geodesic_length=found.geodesic_length,
-        changes=change_entries(found.changes)["changes"],
-        transmissions_rad_or_m=found.transmissions,
-        files={},
-    )
-    say(str(found))
-    for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
-        size = (
-            f"{1e3 * change:.3f} mm" if kind == "prismatic" else f"{1e3 * change:.3f} mrad ({degrees(change):.4f} deg)"
-        )
-        say(f"  transmission of {name}: {size} RMS")
