@@ -22,7 +22,6 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import SessionMarkers
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
@@ -68,17 +67,12 @@ class FitRows:
     @property
     def whole(self) -> bool:
         """Whether each row is predicted by all others, not by those of its block."""
-        return (self.map.data is None and len(self.q) * self.map.m <= WHOLE_COORDINATES) or len(self.blocks) == 1
+        return len(self.blocks) == 1
 
     @property
     def known(self) -> bool:
         """Whether the measured values of the rows are known."""
         return self.of_positions and (self._measured is not None or self.map.data is None)
-
-    @property
-    def in_one_place(self) -> bool:
-        """Whether the measured values are known, and no marker was mounted anew among them."""
-        return self.known and not isinstance(self.map.geodesic.spec.at_controls, SessionMarkers)
 
     @cached_property
     def points(self) -> Tensor:
@@ -111,11 +105,13 @@ class FitRows:
 
     @cached_property
     def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:
-        """Row numbers (B,) of each block, and its factor of G + R."""
+        """Row numbers (B,) of each block, and the model conditioned on them: on all rows the map is that at hand."""
         n, m, _ = self.map.noise.covariance.shape
+        known = self.map.conditional if self.map.data is None and n * m <= WHOLE_COORDINATES else None
+        if isinstance(known, CholeskyRegression):
+            return [(torch.arange(n, device=HOST), known)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)
-        parts = order.tensor_split(ceil(n * m / BLOCK_COORDINATES))
-        parts = [part.sort().values for part in parts]
+        parts = [part.sort().values for part in order.tensor_split(ceil(n * m / BLOCK_COORDINATES))]
         return [(rows, CholeskyRegression(self._linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     @cached_property
@@ -124,14 +120,11 @@ class FitRows:
 
         Where markers were hidden the errors are NaN, and the covariance is that of noise alone.
         """
-        whole, noise = self._predictor, self.map.noise
-        every = torch.arange(len(self), device=self.target.device)
-        parts = [(every, whole)] if len(whole.linearisation.sensitivity) == len(self) else self.blocks
+        noise, seen = self.map.noise, self.map.noise.visible
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
-        for rows, regression in parts:
+        for rows, regression in self.blocks:
             errors[rows], own = regression.left_out(self.target[rows])
             covariance[rows] = own - noise.covariance[rows]
-        seen = noise.visible
         both = seen[:, :, None] & seen[:, None, :]
         return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
 
@@ -141,33 +134,30 @@ class FitRows:
         Subsets are drawn at random from one block; the last number is that of all
         rows that predict one. Outliers keep their small weights and do not count as errors.
         """
-        rows = self.blocks[0][0]
-        target = self.target[rows]
-        n, m = target.shape
-        matrix = self.map.noise.rows(rows).add_to(self._linearised[1].rows(rows).gram())
+        block, m = self.blocks[0][0], self.target.shape[1]
+        n = min(len(block), ceil(BLOCK_COORDINATES / m))
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
-        good, seen = self._inliers(rows), self.map.noise.visible[rows]
-        sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]
-        squares: dict[int, list[Tensor]] = {size: [] for size in sizes}
+        squares: dict[int, list[Tensor]] = {size: [] for size in sizes if n - size >= FEWEST_LEARNED}
         for seed in range(LEARNING_SUBSETS):
-            order = torch.randperm(n, generator=seeded(seed), device=HOST)
-            places = (order[:, None] * m + torch.arange(m, device=HOST)).flatten()
+            rows = block[torch.randperm(len(block), generator=seeded(seed), device=HOST)[:n]]
+            target, noise = self.target[rows], self.map.noise.rows(rows)
+            unseen = ~noise.visible | ~self._inliers[rows, None]
             # The factor of the first rows is the first part of that of all: one serves every size.
-            factor = torch.linalg.cholesky(matrix[places][:, places])
-            white = torch.linalg.solve_triangular(factor, target[order].reshape(-1, 1), upper=False)
-            for size in sizes:
+            factor = torch.linalg.cholesky(noise.add_to(self._linearised[1].rows(rows).gram()))
+            white = torch.linalg.solve_triangular(factor, target.reshape(-1, 1), upper=False)
+            for size, found in squares.items():
                 predicted = (factor[size * m :, : size * m] @ white[: size * m]).view(-1, m)
-                error = (target[order[size:]] - predicted).masked_fill(~seen[order[size:]], nan)[good[order[size:]]]
-                squares[size].append(error.reshape(-1, 3).square().sum(-1))
-        found = [(size, float(torch.cat(values).nanmean().sqrt())) for size, values in squares.items()]
-        rows = torch.arange(len(self), device=rows.device) if self.whole else rows
-        left_out = self.left_out[0][rows][self._inliers(rows)].reshape(-1, 3)
-        return [*found, (len(rows), float(left_out.square().sum(-1).nanmean().sqrt()))]
+                error = (target[size:] - predicted).masked_fill(unseen[size:], nan)
+                found.append(error.reshape(-1, 3).square().sum(-1))
+        curve = [(size, float(torch.cat(values).nanmean().sqrt())) for size, values in squares.items()]
+        left_out = self.left_out[0][block][self._inliers[block]].reshape(-1, 3)
+        return [*curve, (len(block), float(left_out.square().sum(-1).nanmean().sqrt()))]
 
-    def _inliers(self, rows: Tensor) -> Tensor:
-        """(B,) rows whose noise is not that of an outlier: at most four times the typical variance."""
-        variances = self.map.noise.covariance[rows].diagonal(dim1=1, dim2=2)
-        sizes = variances.masked_fill(~self.map.noise.visible[rows], nan).nanmean(1)
+    @cached_property
+    def _inliers(self) -> Tensor:
+        """(N,) rows whose noise is not that of an outlier: at most four times the typical variance."""
+        variances = self.map.noise.covariance.diagonal(dim1=1, dim2=2)
+        sizes = variances.masked_fill(~self.map.noise.visible, nan).nanmean(1)
         return sizes <= 4.0 * sizes.median()
 
     def transmission_deviation(self, joint: int, values: Tensor) -> Tensor:
@@ -181,7 +171,7 @@ class FitRows:
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
-        regression = self._predictor
+        regression = self.blocks[0][1]
         data = regression.linearisation
         q = self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
@@ -198,20 +188,11 @@ class FitRows:
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property
-    def _predictor(self) -> CholeskyRegression:
-        """The model conditioned on all rows, which the map has at hand; of very many, on those of one block."""
-        whole = self.map.conditional if self.whole else None
-        return whole if isinstance(whole, CholeskyRegression) else self.blocks[0][1]
-
-    @cached_property
     def target(self) -> Tensor:
         """(N, m) measured (where hidden: predicted) minus the linear model at zero fields and parameters, m."""
         value, at = self._linearised
-        measured, geodesic = self.points.flatten(1), self.map.geodesic
-        response = torch.einsum("imk,k->im", at.sensitivity, geodesic.momenta.theta)
-        for nodes, flow in ((at.joint, geodesic.joint_flow), (at.task, geodesic.task_flow)):
-            for node, controls in zip(nodes, flow.nodes, strict=True):
-                response = response + node.response(flow.kernel.field(node.points, *controls)).reshape(response.shape)
+        measured = self.points.flatten(1)
+        response = self.map.geodesic.linear_response(at, elsewhere=self.map.data is not None)
         return torch.where(measured.isnan(), value, measured) - value + response
 
     @cached_property

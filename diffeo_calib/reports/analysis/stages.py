@@ -19,6 +19,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import SessionMarkers
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
 Kinematics = Callable[[Tensor], Tensor]
@@ -32,7 +33,8 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     and markers are those that fit the model best.
     """
     rows = FitRows(model) if rows is None else rows
-    if not rows.in_one_place or model.registration is not None or model.rigid_errors is None:
+    mounted_anew = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
+    if not rows.known or mounted_anew or model.registration is not None or model.rigid_errors is None:
         geometries = nominal_kinematics(model).geometry, geometric_kinematics(model).geometry
     else:
         with warnings.catch_warnings():
