@@ -29,6 +29,7 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.table_format import TableFormat
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
 """Widths and heights of images, pixels."""
@@ -50,6 +51,14 @@ class Choice(NamedTuple):
         written = [json.dumps(value, ensure_ascii=False) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
         return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
+
+
+def entries(tables: Sequence[TableFormat], **why: str) -> Iterator[Choice]:
+    """Fields of formats, each with its reason; where the formats differ, a remark for every value, to choose from."""
+    for name, text in why.items():
+        values = dict.fromkeys(getattr(table, name) for table in tables)
+        known = (value for value in values if value not in (None, False))
+        yield from (Choice(name.replace("_", "-"), value, text, sure=len(values) == 1) for value in known)
 
 
 @dataclass(frozen=True)

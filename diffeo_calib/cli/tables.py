@@ -19,8 +19,7 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, check_together, leaves_of, names_of, typed_options
-from diffeo_calib.cli.campaign import has
+from diffeo_calib.cli.app import add_to_command_line, check_together, has, leaves_of, names_of, typed_options
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
 from diffeo_calib.common.device import HOST
@@ -28,8 +27,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, senten
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices

@@ -24,7 +24,7 @@ from diffeo_calib.cli.tables import joint_columns, measured_table
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"

@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outsi
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_configurations
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, options_of

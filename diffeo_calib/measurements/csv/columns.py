@@ -13,8 +13,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import Hideable, repeated
-from diffeo_calib.measurements.csv.expressions import JointExpressions
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,

@@ -22,7 +22,7 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import (
     FileRows,
     ReadingColumns,

@@ -20,7 +20,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import SessionMarkers
-from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.predictions import FitRows
 
 Kinematics = Callable[[Tensor], Tensor]
 

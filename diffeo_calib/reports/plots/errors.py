@@ -13,8 +13,7 @@ from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.predictions import Predictions
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import stages_of
 from diffeo_calib.reports.plots.style import BLUE, FAINT, GREY, INK, LOOKS, finish, legend, literal, note, panels
 from diffeo_calib.sensors.errors import Evaluation

@@ -14,7 +14,7 @@ from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
-from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree

@@ -10,8 +10,7 @@ from torch import Tensor
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
+from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions
 from diffeo_calib.reports.plots.joints import in_bins, joint_label, joint_values
 from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, dots, finish, legend, note, panels
 from diffeo_calib.sensors.errors import Evaluation
