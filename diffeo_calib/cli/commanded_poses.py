@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from diffeo_calib.cli.guesses import ROTATIONS, Sheet
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
@@ -193,8 +193,7 @@ def _read(
         if turn:
             unit = measured.angle if len(turn) == 3 else None
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
+        with quiet(), suppress(DiffeoCalibError):
             robot = cartesian(read_poses(csv, pose, table))
             source = Source(csv, robot, replace(pose, robot=robot), rows, table, sheet.numbers)
             yield source.residual(table), source
@@ -204,8 +203,7 @@ def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor | None:
     """Columns as they are (N, c); None without any, or with empty cells."""
     if not names:
         return None
-    with warnings.catch_warnings(), suppress(DiffeoCalibError):
-        warnings.simplefilter("ignore")
+    with quiet(), suppress(DiffeoCalibError):
         return read_joints(csv, list(names), TableFormat("m", "rad", sheet.sep, sheet.decimal))
     return None
 

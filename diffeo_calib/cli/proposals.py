@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from diffeo_calib.cli.row_columns import Choice, RowColumns, entries
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, few
-from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.lines import read_cells
@@ -74,8 +73,7 @@ def marker(source: Source) -> Choice | None:
     """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
     alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
     for _, _, data in source.in_units() if alone else ():
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
+        with quiet(), suppress(DiffeoCalibError):
             found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
             if found is not None:
                 return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
@@ -116,8 +114,7 @@ class Source:
         Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
         wrong unit the residual alone may be small too. Infinite if the table cannot be read so.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             try:
                 return self.read_residual(table)
             except DiffeoCalibError:
@@ -183,8 +180,7 @@ class Source:
         """Units of length and angle, and the positions of the largest set-up in these, unless the file says others."""
         for length, angle in product(*UNITS):
             found = None
-            with warnings.catch_warnings(), suppress(DiffeoCalibError):
-                warnings.simplefilter("ignore")
+            with quiet(), suppress(DiffeoCalibError):
                 found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
             if found is not None:
                 yield length, angle, found.largest_session()
@@ -347,8 +343,7 @@ def deviations(source: Source) -> Iterator[Choice]:
     if names is None:
         return
     found = None
-    with warnings.catch_warnings(), suppress(DiffeoCalibError):
-        warnings.simplefilter("ignore")
+    with quiet(), suppress(DiffeoCalibError):
         found = measured_positions(source.read(replace(source.table, std=names)))
     if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
         yield Choice("", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used")

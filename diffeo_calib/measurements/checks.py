@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -56,6 +57,14 @@ def of_measurements() -> Iterator[None]:
         yield
     except InputError as error:
         raise error if isinstance(error, MeasurementError) else MeasurementError(str(error)) from None
+
+
+@contextmanager
+def quiet(kind: type[Warning] = Warning) -> Iterator[None]:
+    """Nothing within is warned of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kind)
+        yield
 
 
 def in_other_unit(ratio: float, tolerance: float) -> bool:

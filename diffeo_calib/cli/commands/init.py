@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product, takewhile
@@ -24,6 +23,7 @@ from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, entries, rows_in, tips_of, with_places
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.lines import read_cells
@@ -179,8 +179,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     for arm in (arms := _arms(robot, sheet)):
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # `fit` warns of the right reading
+            with quiet():  # `fit` warns of the right reading
                 rows = rows_in(csv, sheet, arm.columns)
                 tips = tips_of(rows.markers, leaves)
                 chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
