@@ -27,24 +27,6 @@ from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.se3 import nearest_rotations
 
-MACHINE = {"robot", "flange", "tcp", "tool", "ee", "eef", "effector", "gripper", "hand", "command", "cmd", "base"}
-SEEN = {
-    "board",
-    "camera",
-    "cam",
-    "marker",
-    "tracker",
-    "tag",
-    "charuco",
-    "aruco",
-    "pattern",
-    "target",
-    "object",
-    "world",
-}
-SEEN |= WORDS["measured"]
-"""Words of names of the machine's own poses, and of what was seen."""
-WISHED = WORDS["wished"] - {"target"}
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
 SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
@@ -108,9 +90,9 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     """That of the machine: by words of the names, reported ones before wished ones; else the first."""
 
     def rank(own: Body) -> int:
-        if own.words & MACHINE:
+        if own.words & WORDS["machine"]:
             return 2 + bool(own.words & WORDS["measured"])
-        return bool(own.words & WISHED) - len(own.words & SEEN)
+        return bool(own.words & (WORDS["wished"] - {"target"})) - len(own.words & (WORDS["seen"] | WORDS["measured"]))
 
     return max(bodies, key=rank)
 

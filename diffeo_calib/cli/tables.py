@@ -287,11 +287,8 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m."""
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
-    words = text.split(",")
-    values = [value for word in words if (value := _number(word)) is not None]
-    if len(words) not in (3, count) or len(values) < len(words):
-        expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
-        raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
+    expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
+    values = stated_numbers("--tool", text, (3, count), expected)
     frame = torch.eye(4, dtype=torch.float64, device=HOST)
     frame[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
     if len(values) == count:
@@ -433,3 +430,12 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return value if isfinite(value) else None
+
+
+def stated_numbers(option: str, text: str, counts: Sequence[int], expected: str = "") -> list[float]:
+    """Numbers separated by commas; InputError unless there are so many."""
+    values = [value for word in text.split(",") if (value := _number(word)) is not None]
+    if len(values) not in counts or len(values) <= text.count(","):
+        usual = f"{' or '.join(map(str, counts))} numbers, separated by {'a colon' if 2 in counts else 'commas'}"
+        raise InputError.of(f"{option} {text}", expected=expected or usual, fix="write decimal points in numbers")
+    return values
