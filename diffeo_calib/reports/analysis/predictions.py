@@ -256,8 +256,10 @@ class Predictions:
     left_out: bool
 
     @classmethod
-    def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
-        """Predictions of rows that took no part in the fit."""
+    def of(cls, model: CalibratedKinematics, data: Measurements | None = None) -> Predictions:
+        """Predictions of rows that took no part in the fit; by default those of the fit, each by all others."""
+        if data is None:
+            return cls.of_fit(FitRows(model))
         sensor_of(data).check(data, model)
         seen = data.bodies.predicted(model.at_payloads(data.payload), data.q)
         return cls(data, data.origins, seen.origins, seen.places, _errors(seen.points, data), left_out=False)
