@@ -30,8 +30,13 @@ ROLES = {
     "joint": "q j joint joints jnt axis axes ax a rax achse gelenk theta th qpos jpos pos position positions angle "
     "angles state states",
     "external": "e ext external extax eax rail track slide linear",
+    "machine": "robot flange tcp tool ee eef effector gripper hand command cmd base",
+    "seen": "board camera cam marker tracker tag charuco aruco pattern target object world",
 }
-"""What words of names say: a rate is anything but a place or a joint's value, an external axis is beside the arm's."""
+"""What words of names say: a rate is anything but a place or a joint's value, an external axis is beside the arm's.
+
+A machine has poses of its own, beside what was seen.
+"""
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
 UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "kg")}
 UNITS |= {"in": "inch", **dict.fromkeys(("degree", "degrees", "grad"), "deg")}

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from math import inf
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,33 +17,16 @@ from diffeo_calib.cli import proposals
 from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import ROTATIONS, Sheet
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, RowColumns, matrix_in, rows_in
+from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.se3 import nearest_rotations
 
-MACHINE = {"robot", "flange", "tcp", "tool", "ee", "eef", "effector", "gripper", "hand", "command", "cmd", "base"}
-SEEN = {
-    "board",
-    "camera",
-    "cam",
-    "marker",
-    "tracker",
-    "tag",
-    "charuco",
-    "aruco",
-    "pattern",
-    "target",
-    "object",
-    "world",
-}
-SEEN |= WORDS["measured"]
-"""Words of names of the machine's own poses, and of what was seen."""
-WISHED = WORDS["wished"] - {"target"}
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
 SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
@@ -109,9 +90,9 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     """That of the machine: by words of the names, reported ones before wished ones; else the first."""
 
     def rank(own: Body) -> int:
-        if own.words & MACHINE:
+        if own.words & WORDS["machine"]:
             return 2 + bool(own.words & WORDS["measured"])
-        return bool(own.words & WISHED) - len(own.words & SEEN)
+        return bool(own.words & (WORDS["wished"] - {"target"})) - len(own.words & (WORDS["seen"] | WORDS["measured"]))
 
     return max(bodies, key=rank)
 
@@ -154,30 +135,23 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
     why += f", read in any other way {100 * min(worse):.3g} %" if worse else ""
     first = f"{why}; by their names, commanded poses in place of joint values"
-    columns = [*_every("robot-pose", [one.joints.text for one in alike], first)]
+    texts = dict.fromkeys(one.joints.text for one in alike)
+    columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
     return alike[0], columns, [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
 
 
 def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
     """Units and conventions of the ways to read a table that explain it as well as each other."""
     tables = [one.table for one in alike]
-    size = "the size of the numbers" + "; which machine it is, they do not tell" * (len(lengths) > 1)
-    yield from _every("length", lengths if len(lengths) > 1 else [tables[0].length], size)
-    yield from _every("joint-length", [table.joint_length for table in tables], size)
-    yield from _every("angle", [table.angle for table in tables], why)
+    size, several = "the size of the numbers", len(lengths) > 1
+    size += "; which machine it is, they do not tell" * several
+    sized = [replace(tables[0], length=length) for length in lengths] if several else tables[:1]
+    yield from entries(sized, length=size)
+    yield from entries(tables, joint_length=size, angle=why)
     if tables[0].rotation is not None:
         yield Choice("rotation", ",".join(map(str, tables[0].rotation)), "behind the columns of its place")
-        yield from _every("convention", [table.convention for table in tables], why)
-        yield from _every("rotation-angle", [table.rotation_angle for table in tables], "the same")
-    yield from _every(
-        "camera-on-tool", [table.camera_on_tool for table in tables], "what stands is seen from the flange"
-    )
-
-
-def _every(name: str, values: Sequence[Any], why: str) -> Iterator[Choice]:
-    """An entry for every value that is not None or False, for the user to choose from where there are several."""
-    different = list(dict.fromkeys(values))
-    return (Choice(name, one, why, sure=len(different) == 1) for one in different if one not in (None, False))
+        yield from entries(tables, convention=why, rotation_angle="the same")
+    yield from entries(tables, camera_on_tool="what stands is seen from the flange")
 
 
 def _read(
@@ -201,8 +175,7 @@ def _read(
         if turn:
             unit = measured.angle if len(turn) == 3 else None
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
+        with quiet(), suppress(DiffeoCalibError):
             robot = cartesian(read_poses(csv, pose, table))
             source = Source(csv, robot, replace(pose, robot=robot), rows, table, sheet.numbers)
             yield source.residual(table), source
@@ -212,8 +185,7 @@ def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor | None:
     """Columns as they are (N, c); None without any, or with empty cells."""
     if not names:
         return None
-    with warnings.catch_warnings(), suppress(DiffeoCalibError):
-        warnings.simplefilter("ignore")
+    with quiet(), suppress(DiffeoCalibError):
         return read_joints(csv, list(names), TableFormat("m", "rad", sheet.sep, sheet.decimal))
     return None
 

@@ -231,12 +231,6 @@ def guess_matrix(columns: Sequence[str]) -> tuple[list[str], bool] | None:
     return None
 
 
-def guess_sockets(header: Sequence[str]) -> list[str] | None:
-    """The columns place and socket, or socket alone, that name where a ball rested; None without a socket."""
-    known = {name.lower(): name for name in header}
-    return [known[name] for name in ("place", "socket") if name in known] if "socket" in known else None
-
-
 def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     """Texts of `fit --reading` of all kinds of devices, by the names of their columns; these columns."""
     found, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
@@ -254,11 +248,6 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     if pixels is not None:
         found[f"image={','.join(pixels)},{LENS}"] = pixels
     return found
-
-
-def guess_column(header: Sequence[str], words: Sequence[str]) -> str | None:
-    """The first column that has one of these names, but for case, signs and units; None without one."""
-    return next((name for name in header if column(name).plain in words), None)
 
 
 def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> tuple[list[str], str] | None:

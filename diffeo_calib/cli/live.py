@@ -18,8 +18,7 @@ from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.expressions import JointExpressions
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""

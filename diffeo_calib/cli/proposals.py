@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -28,13 +27,13 @@ from diffeo_calib.cli.guesses import (
     guess_rotation,
 )
 from diffeo_calib.cli.options import Rows
-from diffeo_calib.cli.row_columns import Choice, RowColumns
+from diffeo_calib.cli.row_columns import Choice, RowColumns, entries
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, few
-from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
-from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
 from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of
@@ -74,8 +73,7 @@ def marker(source: Source) -> Choice | None:
     """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
     alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
     for _, _, data in source.in_units() if alone else ():
-        with warnings.catch_warnings(), suppress(DiffeoCalibError):
-            warnings.simplefilter("ignore")
+        with quiet(), suppress(DiffeoCalibError):
             found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
             if found is not None:
                 return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
@@ -116,8 +114,7 @@ class Source:
         Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
         wrong unit the residual alone may be small too. Infinite if the table cannot be read so.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet():
             try:
                 return self.read_residual(table)
             except DiffeoCalibError:
@@ -175,16 +172,15 @@ class Source:
                 why += "; these rows do not tell which: uncomment one" * (len(found) > 1)
                 yield Choice("joints", text, why, sure=len(found) == 1)
             if found:
-                yield Choice("length", length, "with these joints")
-                yield Choice("angle", angle, "the same")
+                table = replace(self.table, length=length, angle=angle)
+                yield from entries([table], length="with these joints", angle="the same")
                 return
 
     def in_units(self) -> Iterator[tuple[str, str, Measurements]]:
         """Units of length and angle, and the positions of the largest set-up in these, unless the file says others."""
         for length, angle in product(*UNITS):
             found = None
-            with warnings.catch_warnings(), suppress(DiffeoCalibError):
-                warnings.simplefilter("ignore")
+            with quiet(), suppress(DiffeoCalibError):
                 found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
             if found is not None:
                 yield length, angle, found.largest_session()
@@ -244,7 +240,7 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
     """
     best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
     for length in UNITS_PER_METRE if len(equal) > 1 else ():
-        tables = {angle: replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")}
+        tables = [replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")]
         tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
         (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
         clear.append((second / least if 0 < least < LARGEST_RESIDUAL else 1.0, own))
@@ -278,9 +274,9 @@ def other_units(source: Source, table: TableFormat) -> list[str]:
     return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
 
-def residuals(source: Source, formats: Mapping[Any, TableFormat]) -> list[tuple[float, Any]]:
-    """Median residual of the nominal robot in every format, and its key; the smallest first."""
-    return sorted(((source.residual(table), key) for key, table in formats.items()), key=lambda found: found[0])
+def residuals(source: Source, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
+    """Median residual of the nominal robot in every format; the smallest first."""
+    return sorted(((source.residual(table), table) for table in formats), key=lambda found: found[0])
 
 
 def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
@@ -314,10 +310,10 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     turns = product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,))
     units = product(UNITS_PER_METRE, ("rad", "deg")) if camera else [(table.length, table.angle)]
     known = replace(table, rotation=each[0] if len(each) == 1 else each, camera_on_tool=camera)
-    formats = {
-        (*unit, *turn): replace(known, length=unit[0], angle=unit[1], convention=turn[0], rotation_angle=turn[1])
+    formats = (
+        replace(known, length=unit[0], angle=unit[1], convention=turn[0], rotation_angle=turn[1])
         for unit, turn in product(units, turns)
-    }
+    )
     clear = residuals(source, formats)
     if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
         what = (
@@ -329,21 +325,16 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
         if not camera:
             yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
         return
-    (best, (length, angle, convention, unit)), *worse = clear
+    (best, table), *worse = clear
     why = f"the nominal robot leaves, of what the rows vary, {100 * best:.2g} %"
     why += f", read in any other way at least {100 * worse[0][0]:.3g} %" if worse and worse[0][0] < inf else ""
     written = [",".join(own) for own in each]
     if camera:
-        yield Choice("length", length, why)
-        yield Choice("angle", angle, "the same")
-        yield Choice(
-            "camera-on-tool", True, "the nominal robot explains poses of a fixed board alone, seen from the tool"
-        )
+        seen = "the nominal robot explains poses of a fixed board alone, seen from the tool"
+        yield from entries([table], length=why, angle="the same", camera_on_tool=seen)
     without = "without these three lines positions alone are calibrated"
     yield Choice("rotation", written[0] if len(written) == 1 else written, f"by their names; {without}")
-    yield Choice("convention", convention, why)
-    if unit is not None:
-        yield Choice("rotation-angle", unit, "the same")
+    yield from entries([table], convention=why, rotation_angle="the same")
 
 
 def deviations(source: Source) -> Iterator[Choice]:
@@ -352,8 +343,7 @@ def deviations(source: Source) -> Iterator[Choice]:
     if names is None:
         return
     found = None
-    with warnings.catch_warnings(), suppress(DiffeoCalibError):
-        warnings.simplefilter("ignore")
+    with quiet(), suppress(DiffeoCalibError):
         found = measured_positions(source.read(replace(source.table, std=names)))
     if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
         yield Choice("", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used")

@@ -16,12 +16,10 @@ from diffeo_calib.cli.guesses import (
     LENS,
     NAMED,
     Sheet,
-    guess_column,
     guess_matrix,
     guess_positions,
     guess_readings,
     guess_sheet,
-    guess_sockets,
 )
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, few
@@ -29,6 +27,7 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.table_format import TableFormat
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
 """Widths and heights of images, pixels."""
@@ -50,6 +49,14 @@ class Choice(NamedTuple):
         written = [json.dumps(value, ensure_ascii=False) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
         return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
+
+
+def entries(tables: Sequence[TableFormat], **why: str) -> Iterator[Choice]:
+    """Fields of formats, each with its reason; where the formats differ, a remark for every value, to choose from."""
+    for name, text in why.items():
+        values = dict.fromkeys(getattr(table, name) for table in tables)
+        known = (value for value in values if value not in (None, False))
+        yield from (Choice(name.replace("_", "-"), value, text, sure=len(values) == 1) for value in known)
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,8 @@ class RowColumns:
 
 def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""
-    sockets = guess_sockets(sheet.header) or []
+    known = {name.lower(): name for name in sheet.header}
+    sockets = [known[name] for name in ("place", "socket") if name in known and "socket" in known]
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
     markers, unmeasured = guess_positions([name for name in with_gaps if name not in joints])
     left = [f"{few(names)}: {why}" for names, why in unmeasured]
@@ -125,10 +133,12 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
     named = [name for name in sheet.header if name not in joints]
     columns = {"session": [] if sockets and not readings else named}
-    guessed = {option: guess_column(columns.get(option, others), one.names) for option, one in NAMED.items()}
-    nine = [name for own in matrix[1:] for name in own]
-    found = {option: name for option, name in guessed.items() if name is not None}
-    return RowColumns(markers, sockets, readings, found, nine, left)
+    guessed = {
+        option: [name for name in columns.get(option, others) if column(name).plain in one.names]
+        for option, one in NAMED.items()
+    }
+    found = {option: names[0] for option, names in guessed.items() if names}
+    return RowColumns(markers, sockets, readings, found, [name for own in matrix[1:] for name in own], left)
 
 
 def matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
@@ -157,7 +167,7 @@ def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool
 
 
 def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
-    """The files of the cameras beside the table, such as `images` has written, else the size of the images."""
+    """The files of the cameras beside the table, as `images` writes them, else a usual size that holds all corners."""
     header, rows = read_cells(csv, sheet.sep)
     names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
     files = [f"{name}.yaml" for name in names if name]
@@ -170,14 +180,10 @@ def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
             cameras.append(file)
     if len(files) < 2 and len(cameras) == 1:
         return [f"{CORNERS}{cameras[0]}"]
-    return [f"{CORNERS}{','.join(map(str, _image_size(header, rows, sheet.decimal)))}"]
-
-
-def _image_size(header: Sequence[str], rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> tuple[int, int]:
-    """The least usual size of images that hold all corners, pixels."""
     places = [header.index(name) for name in PIXEL]
-    width, height = (max(number(cells[k], decimal) or 0.0 for _, cells in rows) for k in places)
-    return next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
+    width, height = (max(number(cells[k], sheet.decimal) or 0.0 for _, cells in rows) for k in places)
+    size = next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
+    return [f"{CORNERS}{','.join(map(str, size))}"]
 
 
 def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:

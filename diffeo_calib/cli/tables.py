@@ -19,8 +19,7 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, check_together, leaves_of, names_of, typed_options
-from diffeo_calib.cli.campaign import has
+from diffeo_calib.cli.app import add_to_command_line, check_together, has, leaves_of, names_of, typed_options
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
 from diffeo_calib.common.device import HOST
@@ -28,8 +27,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, senten
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joints import PROGRAM, PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.pose_columns import PROGRAM, PoseColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -40,8 +39,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 POSE_JOINTS = 6
-KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
-"""Kinds with one column."""
 NEEDS = {"--lever": "--rotation", "--camera-on-tool": "--rotation --reading", "--places": "--by", "--by": "--places"}
 NEEDS |= {"--distance-std": "--socket", "--distance": "--distance-std"}
 """Options of rows, and those of which they need one."""
@@ -118,19 +115,22 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
         command: that made the model, or the options of its table alone; empty where neither is known.
         rows: None for a table of joint values alone.
     """
-    own = rows or Rows()
+    own, words = rows or Rows(), list[str]()
     groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
     try:
-        stored = shlex.split(command) if groups else []
-        known = {option: texts for group in groups for option, texts in _read_options(stored, group).items()}
-        typed = {f"--{name.replace('_', '-')}" for name, value in (vars(own) | vars(units)).items() if value}
-        typed |= {"--places"} | ({"--by"} if own.places is None else set())  # of the file of the fit
-        words = [word for option, texts in known.items() if option not in typed for word in texts]
+        stored = shlex.split(command) if groups or own.marker else []
+        known = {group: _stated(stored, group) for group in groups}
+        typed = {name for name, value in (vars(own) | vars(units)).items() if value}
+        typed |= {"places"} | ({"by"} if own.places is None else set())  # of the file of the fit
         if own.marker is not None and "=" not in own.marker:
-            order = _read_options(shlex.split(command), Rows).get("--marker", [""])[-1].partition("=")[1:]
+            order = _stated(stored, Rows).get("marker", ("", []))[0].partition("=")[1:]
             own = replace(own, marker=own.marker + "".join(order))
             add_to_command_line(["--marker", str(own.marker)])
-        completed = _completed(own, words), _completed(units, words)
+        completed = list[Any]()
+        for group in (own, units):
+            taken = {name: one for name, one in known.get(type(group), {}).items() if name not in typed}
+            completed.append(replace(group, **{name: value for name, (value, _) in taken.items()}))
+            words += [word for _, own_words in taken.values() for word in own_words]
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
@@ -141,7 +141,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return completed
+    return completed[0], completed[1]
 
 
 def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
@@ -164,37 +164,28 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     return replace(rows, reading=kept or None, **changes), missing
 
 
-def _options_of(group: type[Units] | type[Rows]) -> dict[str, tuple[str, Any]]:
-    """Option -> name and type of its field."""
-    return {names_of(field)[0]: (name, hint) for name, (hint, field) in leaves_of(group)}
+def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, tuple[Any, list[str]]]:
+    """Field of a group -> its value in a command line, and the words that state it.
 
-
-def _read_options(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, list[str]]:
-    """Option of a group -> its words in a command line."""
-    found: dict[str, list[str]] = {}
-    options = _options_of(group)
-    for place, word in enumerate(words):
-        option, equal, value = word.partition("=")
-        if option in options:
-            flag = options[option][1] is bool
-            own = [option] if flag else [option, value if equal else words[place + 1]]
-            found[option] = [*found.get(option, ()), *own] if has(options[option][1], list) else own
-    return found
-
-
-def _completed(group: Any, words: Sequence[str]) -> Any:
-    """A group of options with those of some words of a command line."""
-    options, changes = _options_of(type(group)), dict[str, Any]()
-    for option, own in _read_options(words, type(group)).items():
-        name, kind = options[option]
-        texts = own[1::2]
-        allowed = next((get_args(one) for one in (kind, *get_args(kind)) if get_origin(one) is Literal), texts)
-        wrong = [text for text in texts if text not in allowed]
-        if wrong:
+    ValueError or IndexError for a value that is none.
+    """
+    found = dict[str, tuple[Any, list[str]]]()
+    for name, (hint, field) in leaves_of(group):
+        option, given = names_of(field)[0], list[list[str]]()
+        for place, word in enumerate(words):
+            begin, equal, value = word.partition("=")
+            if begin == option:
+                given.append([option] if hint is bool else [option, value if equal else words[place + 1]])
+        given = given if has(hint, list) else given[-1:]
+        texts = [own[-1] for own in given]
+        allowed = next((get_args(one) for one in (hint, *get_args(hint)) if get_origin(one) is Literal), texts)
+        if wrong := [text for text in texts if text not in allowed]:
             raise ValueError(f"'{wrong[0]}' for {option}")
-        values = [float(text) for text in texts] if has(kind, float) else texts
-        changes[name] = True if kind is bool else values if has(kind, list) else values[-1]
-    return replace(group, **changes)
+        if given:
+            values = [float(text) for text in texts] if has(hint, float) else texts
+            value = True if hint is bool else values if has(hint, list) else values[-1]
+            found[name] = value, [word for own in given for word in own]
+    return found
 
 
 # --- tables -------------------------------------------------------------------------------------------------------
@@ -300,11 +291,8 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m."""
     convention = table.convention or "rotvec"
     count = 3 + numbers_of(convention)
-    words = text.split(",")
-    values = [value for word in words if (value := _number(word)) is not None]
-    if len(words) not in (3, count) or len(values) < len(words):
-        expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
-        raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
+    expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
+    values = stated_numbers("--tool", text, (3, count), expected)
     frame = torch.eye(4, dtype=torch.float64, device=HOST)
     frame[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
     if len(values) == count:
@@ -375,17 +363,12 @@ def socket_columns(
     if socket is None:
         return None
     known = dict(_distance(text, table) for text in distance or ())
-    return SocketColumns(
-        tuple(name.strip() for name in socket.split(",")),
-        known or None,
-        None if std is None else std / table.per_metre,
-    )
+    return SocketColumns(tuple(_split_names(socket)), known or None, None if std is None else std / table.per_metre)
 
 
 def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     pair, _, length = text.rpartition("=")
-    names = tuple(name.strip() for name in pair.split(","))
-    value = _number(length) or 0.0
+    names, value = _split_names(pair), _number(length) or 0.0
     if len(names) != 2 or value <= 0.0:
         fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
         raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
@@ -431,22 +414,20 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
 
 def reading_columns(text: str, device: str | None, names: Sequence[str] = ()) -> ReadingColumns:
     """KIND=COLUMN as columns; images have two, and the four numbers of their cameras. ``names``: of all columns."""
-    kind, _, rest = text.partition("=")
-    words = tuple(word.strip() for word in rest.split(","))
-    numbers = [_number(word) for word in words]
-    if kind == "image" and len(words) == 6 and all(words[:2]):
-        fx, fy, cx, cy = numbers[2:]
+    word, _, rest = text.partition("=")
+    first, *others = words = tuple(_split_names(rest))
+    kind = next((kind for kind in known_kinds().values() if word in kind.columns()), None)
+    if word == "image" and len(words) == 6 and all(words[:2]):
+        fx, fy, cx, cy = map(_number, words[2:])
         if fx and fy and cx is not None and cy is not None and min(fx, fy) > 0.0:
             return ReadingColumns("image", words[:2], device, intrinsics=(fx, fy, cx, cy))
-    elif kind in KINDS and len(words) == 1 and words[0]:
-        value = words if numbers[0] is None or words[0] in names else numbers[0]
-        if kind == "distance" and isinstance(value, float) and value <= 0.0:
+    elif kind is not None and len(words) == kind.numbers_each and all(words):
+        value = None if others or first in names else _number(first)
+        if word == "distance" and value is not None and value <= 0.0:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
-        return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
-    own = None if kind in (*KINDS, "image") else known_kinds().get(kind)
-    if own is not None and len(words) == own.numbers_each and all(words):
-        return ReadingColumns(kind, words, device, unit=own.unit)
+        zero = UNKNOWN_ZERO_M * (word == "displacement")
+        return ReadingColumns(kind.kind, words if value is None else value, device, zero, unit=kind.unit)
     expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 
@@ -458,3 +439,12 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return value if isfinite(value) else None
+
+
+def stated_numbers(option: str, text: str, counts: Sequence[int], expected: str = "") -> list[float]:
+    """Numbers separated by commas; InputError unless there are so many."""
+    values = [value for word in text.split(",") if (value := _number(word)) is not None]
+    if len(values) not in counts or len(values) <= text.count(","):
+        usual = f"{' or '.join(map(str, counts))} numbers, separated by {'a colon' if 2 in counts else 'commas'}"
+        raise InputError.of(f"{option} {text}", expected=expected or usual, fix="write decimal points in numbers")
+    return values

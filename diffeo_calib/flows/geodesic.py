@@ -190,10 +190,6 @@ class Flow:
         """The controls' state (2, N, n) at time 1."""
         return self.nodes[-1]
 
-    def velocities(self) -> list[Tensor]:
-        """v_t at the controls, (N, n), for every node of the time grid."""
-        return [self.kernel.field(None, q, a) for q, a in self.nodes]
-
     def energy_drift(self) -> float:
         """|H(1) - H(0)| / H(0): zero for the exact flow."""
         start, end = (float(energy(self.kernel, *node)) for node in (self.nodes[0], self.nodes[-1]))

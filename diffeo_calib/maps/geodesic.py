@@ -172,17 +172,17 @@ class GeodesicDeformation(Deformation):
         )
         return z[-1].reshape(sensitivity.shape[:2]), linearisation
 
-    def linear_response(self, at: Linearisation) -> Tensor:
+    def linear_response(self, at: Linearisation, *, elsewhere: bool = False) -> Tensor:
         """Linear effect of this deformation's own fields and theta on k1 at its controls: (N, m).
 
         Args:
-            at: the linearisation of this deformation at its controls.
+            at: the linearisation of this deformation at its controls. elsewhere: whether it is at other configurations.
         """
         total = torch.einsum("imk,k->im", at.sensitivity, self.momenta.theta)
-        for node, v in zip(at.joint, self.joint_flow.velocities(), strict=True):
-            total = total + node.response(v)
-        for node, w in zip(at.task, self.task_flow.velocities(), strict=True):
-            total = total + node.response(w).reshape(total.shape)
+        for nodes, flow in ((at.joint, self.joint_flow), (at.task, self.task_flow)):
+            for node, (q, a) in zip(nodes, flow.nodes, strict=True):
+                field = flow.kernel.field(node.points if elsewhere else None, q, a)
+                total = total + node.response(field).reshape(total.shape)
         return total
 
     def momentum_sensitivities(self) -> tuple[list[NodeSensitivity], list[NodeSensitivity]]:

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from math import isnan
 from pathlib import Path
 
@@ -54,6 +57,14 @@ def of_measurements() -> Iterator[None]:
         yield
     except InputError as error:
         raise error if isinstance(error, MeasurementError) else MeasurementError(str(error)) from None
+
+
+@contextmanager
+def quiet(kind: type[Warning] = Warning) -> Iterator[None]:
+    """Nothing within is warned of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kind)
+        yield
 
 
 def in_other_unit(ratio: float, tolerance: float) -> bool:
@@ -330,3 +341,28 @@ def _check_whole(empty: Tensor) -> None:
         what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
         expected = "three finite numbers, or NaN for all three of a hidden marker"
         raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
+
+
+def rare_names(names: Sequence[str], lines: Sequence[int], fewest: int) -> list[str]:
+    """Names with fewer rows than that, in words: with their rows, and the frequent name that they resemble.
+
+    Most of them are spelling mistakes of another name.
+
+    Args:
+        names: (N,) of the rows, "" for none. lines: (N,) numbers of the rows in their file. fewest: rows of a name.
+    """
+    counts = Counter(name for name in names if name)
+    usual = [name for name, count in counts.items() if count >= fewest]
+    found = []
+    for name, count in counts.items():
+        if count < fewest:
+            own = [line for line, other in zip(lines, names, strict=True) if other == name]
+            near = get_close_matches(name, [other for other in usual if _digits(other) == _digits(name)], n=1)
+            meant = "".join(f", perhaps meant as '{other}'" for other in near)
+            found.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(own)}){meant}")
+    return found
+
+
+def _digits(name: str) -> str:
+    """The digits of a name: names that differ in them, such as "0/0" and "0/1", are seldom meant for one another."""
+    return "".join(character for character in name if character.isdigit())

@@ -7,7 +7,6 @@ the pose back.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number, wrapped
 from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.robots import se3
 from diffeo_calib.robots.se3 import transforms
 
@@ -141,8 +141,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
         numbers[numbers[:, 3] < 0] *= -1
         numbers = numbers[:, [3, 0, 1, 2]] if convention == "quat_wxyz" else numbers
     else:
-        with warnings.catch_warnings():  # gimbal lock: SciPy sets the third angle to zero
-            warnings.simplefilter("ignore", UserWarning)
+        with quiet(UserWarning):  # gimbal lock: SciPy sets the third angle to zero
             numbers = rotation.as_euler(convention, degrees=degrees)
     return torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
 

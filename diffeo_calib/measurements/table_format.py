@@ -17,6 +17,8 @@ Names = Sequence[str] | Sequence[Sequence[str]]
 """Names of columns: a list, or one for each marker or frame."""
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 """A length in a file is divided by this."""
+BESIDE = ("time", "temperature", "payload")
+"""Columns with one number a row beside joints and what was measured, which any table may have."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +102,9 @@ class TableFormat:
             raise MeasurementError.of("`sep` and `decimal`", expected="different characters", got=got, fix=fix)
 
     @property
-    def covariates(self) -> dict[str, str]:
-        """Names of the columns with which something may drift, by what they hold."""
-        given = {"time": self.time, "temperature": self.temperature}
-        return {name: column for name, column in given.items() if column is not None}
+    def beside(self) -> dict[str, str]:
+        """Names of the columns of :data:`BESIDE`, by what they hold."""
+        return {name: column for name in BESIDE if (column := getattr(self, name)) is not None}
 
     @property
     def per_metre(self) -> float:
@@ -121,8 +122,8 @@ class TableFormat:
         return UNITS_PER_METRE[self.joint_unit]
 
     def joints_only(self, joints: Any, kinds: Sequence[str] | None = None) -> TableFormat:
-        """The same units, marks, payload and covariates, for a table of the values of these joints."""
-        kept = "length", "angle", "sep", "decimal", "joint_length", "payload", "time", "temperature"
+        """The same units, marks and columns beside them, for a table of the values of these joints."""
+        kept = "length", "angle", "sep", "decimal", "joint_length", *BESIDE
         return TableFormat(**{name: getattr(self, name) for name in kept}, joints=joints, kinds=kinds)
 
     @property

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
-from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
 from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets

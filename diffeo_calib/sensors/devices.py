@@ -18,10 +18,9 @@ from torch.func import jacrev, vmap
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.checks import numbers_of
+from diffeo_calib.measurements.checks import numbers_of, rare_names
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
-from diffeo_calib.measurements.rare_names import rare_names
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES

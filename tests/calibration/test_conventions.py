@@ -11,7 +11,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.conventions import socket_projector
 from diffeo_calib.calibration.diagnostics.likely_mistakes import conventions_of
-from diffeo_calib.measurements.csv.expressions import JointExpressions
+from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

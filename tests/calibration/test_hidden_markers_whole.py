@@ -17,8 +17,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.predictions import Predictions
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
 

@@ -15,8 +15,7 @@ from typer.main import get_command
 
 import diffeo_calib as dc
 from diffeo_calib.cli.app import DECLARED as KNOWN
-from diffeo_calib.cli.app import app
-from diffeo_calib.cli.campaign import expanded
+from diffeo_calib.cli.app import app, expanded
 from diffeo_calib.cli.guesses import (
     guess_deviations,
     guess_joints,

@@ -21,8 +21,8 @@ import diffeo_calib as dc
 from diffeo_calib.cli import commanded_poses
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv import pose_columns
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv import joints
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.placement import rigid_fit
@@ -296,7 +296,7 @@ def test_a_function_in_place_of_a_robot(
 
 def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    pose_columns._module.cache_clear()
+    joints._module.cache_clear()
     commanded = flange()
     torch.save(commanded, tmp_path / "frames.pt")
     text = "import torch\n\ndef kinematics(cells):\n    return torch.load('frames.pt')\n"
@@ -329,7 +329,7 @@ def test_functions_that_are_none(
     text: str | None, name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    pose_columns._module.cache_clear()
+    joints._module.cache_clear()
     if text is not None:
         (tmp_path / "own.py").write_text(text, encoding="utf-8")
     with pytest.raises(MeasurementError, match=message):

@@ -80,14 +80,6 @@ def test_path_starts_at_the_identity(case: Case) -> None:
     torch.testing.assert_close(jacobians[0], eye, rtol=0, atol=0)
 
 
-@every_case
-def test_velocities_are_the_fields_at_the_nodes(case: Case) -> None:
-    flow = flow_of(case)
-    for v, (q, a) in zip(flow.velocities(), flow.nodes, strict=True):
-        expected = (case.matrix(q, q) @ a.flatten()).view(N, case.dim)
-        torch.testing.assert_close(v, expected, rtol=1e-12, atol=1e-13)
-
-
 CURVED = [case for case in CASES if case.name not in ("matern-1.5", "constant", "output")]
 
 

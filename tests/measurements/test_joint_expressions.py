@@ -12,8 +12,8 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.expressions import JointExpressions
 from diffeo_calib.measurements.csv.files import read_joints, write_measurements
+from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.csv.writing import Program
 from diffeo_calib.measurements.table_format import TableFormat

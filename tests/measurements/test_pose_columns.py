@@ -12,7 +12,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints, read_poses
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, rotation_numbers
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.se3 import transforms

@@ -12,10 +12,9 @@ from scipy.stats import chi2
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.reports.analysis import fit_rows
+from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
-from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
-from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
+from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.repeats import repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, stages_of
 from diffeo_calib.reports.html.sentences import advice
@@ -68,8 +67,8 @@ def test_of_very_many_rows_only_those_of_a_block_predict_one(arm_200: Case, monk
     whole, blocks = FitRows(arm_200.model), FitRows(arm_200.model)
     assert whole.whole
     errors = whole.left_out[0]
-    monkeypatch.setattr(fit_rows, "WHOLE_COORDINATES", 0)
-    monkeypatch.setattr(fit_rows, "BLOCK_COORDINATES", 100)
+    monkeypatch.setattr(predictions, "WHOLE_COORDINATES", 0)
+    monkeypatch.setattr(predictions, "BLOCK_COORDINATES", 100)
     assert not blocks.whole
     assert blocks.learning_curve()[-1][0] < len(blocks)
     assert blocks.left_out[0].norm() > errors.norm()

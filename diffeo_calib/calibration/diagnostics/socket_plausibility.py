@@ -27,8 +27,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.measurements.checks import in_other_unit
-from diffeo_calib.measurements.rare_names import rare_names
+from diffeo_calib.measurements.checks import in_other_unit, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements

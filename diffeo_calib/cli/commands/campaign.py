@@ -14,17 +14,17 @@ import typer
 from diffeo_calib.campaign.campaign import Campaign
 from diffeo_calib.campaign.feeds import Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
-from diffeo_calib.cli.commands.acceptance import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.models import robot_of
+from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, measured_table
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
-from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.declarations import EvaluateOptions
 from diffeo_calib.cli.models import (
@@ -20,7 +19,15 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.printed import ErrorTable, expectation_lines, outlier_lines, registration_lines, socket_lines
+from diffeo_calib.cli.printed import (
+    ErrorTable,
+    accept,
+    expectation_lines,
+    outlier_lines,
+    parsed_limit,
+    registration_lines,
+    socket_lines,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product, takewhile
@@ -21,9 +20,10 @@ from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, g
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, Links
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, rows_in, tips_of, with_places
+from diffeo_calib.cli.row_columns import Choice, entries, rows_in, tips_of, with_places
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.lines import read_cells
@@ -74,11 +74,23 @@ def run(given: InitOptions) -> None:
         read_cells(given.csv, ",")  # says why not
     csv, joined = with_places(given.csv, given.places, output.parent)
     sheet = guess_sheet(csv)
-    choices = [Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])), *joined]
     try:
-        choices += _commanded(csv, given.robot, output, sheet) or _choices(csv, given.robot or Path(), output, sheet)
+        found = _commanded(csv, given.robot, sheet) or _of_robot(csv, given.robot or Path(), output.parent, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
+    source, names, units = found
+    choices = [
+        Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
+        *joined,
+        *names,
+    ]
+    choices += (one._replace(value=_from_folder(one.value, output.parent)) for one in source.rows.entries())
+    choices += [] if source.marker is None else [source.marker]
+    sep = "tab" if sheet.sep == "\t" else sheet.sep
+    choices.append(Choice("sep", sep, f"{len(sheet.numbers)} columns are numbers with it"))
+    choices += [Choice("decimal", sheet.decimal, "the same"), *units]
+    choices.append(Choice("output", csv.with_suffix(".safetensors").name, "the model"))
+    choices.append(Choice("report", csv.with_suffix(".html").name, "the report"))
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -95,56 +107,45 @@ def run(given: InitOptions) -> None:
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
 
 
-def _choices(csv: Path, robot: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
-    folder, urdf = output.parent, is_urdf(robot)
-    yield Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")
+Proposal = tuple[Source, list[Choice], list[Choice]]
+"""A table that is read, entries about robot and joints, and entries about units and what else is in the table."""
+
+
+def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Proposal:
+    """The proposal for a table with joint values of a robot."""
+    urdf = is_urdf(robot)
+    about = [Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")]
     arm, why, seen, names, units = _explained(csv, robot, sheet)
     if urdf:
-        yield Choice("base", arm.links.base or "", "root of the URDF")
+        about.append(Choice("base", arm.links.base or "", "root of the URDF"))
     if arm.links.dh_convention is not None:
-        yield Choice("dh-convention", arm.links.dh_convention, "the convention with which it explains the rows")
+        convention = "the convention with which it explains the rows"
+        about.append(Choice("dh-convention", arm.links.dh_convention, convention))
     if seen.tips:
-        yield Choice("tip", list(seen.tips), "leaves after which the columns are named")
+        about.append(Choice("tip", list(seen.tips), "leaves after which the columns are named"))
     elif arm.links.tip is not None:
-        yield Choice("tip", arm.links.tip[0], why)
-    yield from names
-    for choice in seen.rows.entries():
-        yield choice._replace(value=_from_folder(choice.value, folder))
-    if seen.marker is not None:
-        yield seen.marker
-    yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
-    yield Choice("decimal", sheet.decimal, "the same")
-    yield from units
-    others = proposals.other_units(seen, _format(units, seen))
-    if others:
-        yield Choice("", "", f"{few(others)}: the names say another unit than the robot finds in the numbers: check it")
-    if not any(choice.name == "rotation" for choice in units):
-        yield from proposals.beside(replace(seen, table=_format(units, seen)), sheet)
-    yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    yield Choice("report", csv.with_suffix(".html").name, "the report")
+        about.append(Choice("tip", arm.links.tip[0], why))
+    read = replace(seen, table=_format(units, seen))
+    if others := proposals.other_units(seen, read.table):
+        remark = f"{few(others)}: the names say another unit than the robot finds in the numbers: check it"
+        units = [*units, Choice("", "", remark)]
+    beside = [] if any(choice.name == "rotation" for choice in units) else proposals.beside(read, sheet)
+    return seen, [*about, *names], [*units, *beside]
 
 
-def _commanded(csv: Path, robot: Path | None, output: Path, sheet: Sheet) -> list[Choice]:
-    """Entries of a table with poses of the machine; none where a robot is named whose joints the table has."""
-    left = list[Choice]()
-    if robot is not None:
+def _commanded(csv: Path, robot: Path | None, sheet: Sheet) -> Proposal | None:
+    """That for a table with poses of the machine; None where a robot is named whose joints the table has."""
+    if robot is None:
+        return commanded_poses.choices(csv, sheet)
+    try:
+        _arms(robot, sheet)
+    except InputError as error:
         try:
-            _arms(robot, sheet)
-        except InputError as error:
-            try:
-                source, columns, units = commanded_poses.choices(csv, sheet)
-            except DiffeoCalibError:
-                raise error from None
-            left = [Choice("", "", f"{robot}: not used, no column is named after its joints")]
-        else:
-            return []
-    else:
-        source, columns, units = commanded_poses.choices(csv, sheet)
-    entries = (choice._replace(value=_from_folder(choice.value, output.parent)) for choice in source.rows.entries())
-    sep = Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
-    files = Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    report = Choice("report", csv.with_suffix(".html").name, "the report")
-    return [*left, *columns, *entries, sep, Choice("decimal", sheet.decimal, "the same"), *units, files, report]
+            source, columns, units = commanded_poses.choices(csv, sheet)
+        except DiffeoCalibError:
+            raise error from None
+        return source, [Choice("", "", f"{robot}: not used, no column is named after its joints"), *columns], units
+    return None
 
 
 def _from_folder(value: Any, folder: Path) -> Any:
@@ -178,8 +179,7 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     for arm in (arms := _arms(robot, sheet)):
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # `fit` warns of the right reading
+            with quiet():  # `fit` warns of the right reading
                 rows = rows_in(csv, sheet, arm.columns)
                 tips = tips_of(rows.markers, leaves)
                 chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
@@ -302,27 +302,26 @@ def _units(source: Source) -> Iterator[Choice]:
         others = sorted([*found, *_left(source, lengths, lengths, boards=boards)], key=lambda entry: entry[0])
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
     if by_limits := not any(source.robot.periodic) and [
-        (left, key) for left, key in found if left < inf and _within(source, key)
+        (left, table) for left, table in found if left < inf and _within(source, table)
     ]:
         found = by_limits  # all lengths in another unit are another size, which the rows do not show
-    (best, (length, angle, slides, camera)), *others = found
+    (best, table), *others = found
     excluded = found[-1][0] == inf
-    named = [
-        (left, key)
-        for left, key in found
-        if not proposals.other_units(source, replace(source.table, length=key[0], angle=key[1]))
-    ]
+    named = [(left, table) for left, table in found if not proposals.other_units(source, table)]
     by_names = not proposals.is_clear(found, CLEAR_RATIO) and 0 < len(named) < len(found)
     if by_names := by_names and named[0][0] < CLEAR_RATIO * best:
-        (best, (length, angle, slides, camera)), *others = found = named
+        (best, table), *others = found = named
     clear = proposals.is_clear(found, CLEAR_RATIO)
     poses = [] if clear else list(proposals.rotation(source, camera=True))
     if best == inf and not poses:
-        source.read_residual(replace(source.table, length=length, angle=angle))  # says why
+        source.read_residual(table)  # says why
     meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best))
     if not clear and not poses and not meant:
-        read = [(value, units) for value, units in found if value < inf]
-        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * value:.3g} %" for value, units in read)
+        camera = "camera on the tool"
+        read = [
+            (left, (t.length, t.angle, t.joint_length, camera * t.camera_on_tool)) for left, t in found if left < inf
+        ]
+        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * left:.3g} %" for left, units in read)
         got += "; the units that the file states exclude others" * excluded
         sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
         fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
@@ -336,33 +335,30 @@ def _units(source: Source) -> Iterator[Choice]:
     why = source.words(best, others[0][0] if others else inf)
     why += ", by the names of the columns: the numbers leave it open" * by_names
     why += ", by the limits of the joints: the numbers leave it open" * bool(by_limits)
-    yield Choice("length", length, "of lengths that you add: the table holds none" if no_length else why)
-    yield Choice("angle", angle, why if no_length else "the same")
-    if slides:
-        yield Choice("joint-length", slides, "the same: the slides are in another unit")
-    if camera:
-        yield Choice("camera-on-tool", True, "the same; else the board is on the tool")
+    length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
+    camera, slides = "the same; else the board is on the tool", "the same: the slides are in another unit"
+    yield from entries([table], length=length, angle=angle, joint_length=slides, camera_on_tool=camera)
 
 
-def _within(source: Source, key: tuple[Any, ...]) -> bool:
+def _within(source: Source, table: TableFormat) -> bool:
     """Whether values of joints in some units lie within the limits, in more than a small part of these."""
-    table = replace(source.table, length=key[0], angle=key[1], joint_length=key[2])
-    q, (low, high) = (
-        read_joints(source.csv, source.joints, table, kinds=source.robot.kinds),
-        source.robot.limits.unbind(1),
-    )
+    low, high = source.robot.limits.unbind(1)
+    q = read_joints(source.csv, source.joints, table, kinds=source.robot.kinds)
     part = (q.amax(0) - q.amin(0)) / (high - low)
     return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 
 
-def _left(source: Source, lengths: list[str], slides: list[Any], *, boards: bool) -> list[tuple[float, Any]]:
+def _left(
+    source: Source, lengths: list[str], slides: Sequence[str | None], *, boards: bool
+) -> list[tuple[float, TableFormat]]:
     """Share of the rows that is left with units of length and angle, of slides, and with the camera on the tool."""
     angles = ("rad", "deg") if any(source.robot.periodic) else ("rad",)
-    formats = {
-        key: replace(source.table, length=key[0], angle=key[1], joint_length=key[2], camera_on_tool=bool(key[3]))
-        for key in product(lengths, angles, slides, ("", "camera on the tool") if boards else ("",))
-        if key[2] != key[0]
-    }
+    ways = product(lengths, angles, slides, (False, True) if boards else (False,))
+    formats = (
+        replace(source.table, length=length, angle=angle, joint_length=slide, camera_on_tool=camera)
+        for length, angle, slide, camera in ways
+        if slide != length
+    )
     return proposals.residuals(source, formats)
 
 

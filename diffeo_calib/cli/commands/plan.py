@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from math import isfinite, pi, radians
+from math import pi, radians
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, plan
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, written_columns
+from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format, written_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -49,7 +49,9 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
         if text in TRACKERS:
             found.append(TRACKERS[text]())
         elif kind in SENSORS and values:
-            numbers.setdefault(kind, []).append([x / table.per_metre for x in _numbers("--sensor", values, (3, 4, 6))])
+            numbers.setdefault(kind, []).append(
+                [x / table.per_metre for x in stated_numbers("--sensor", values, (3, 4, 6))]
+            )
         else:
             expected = f"{', '.join(TRACKERS)}, or {', '.join(f'{kind}=NUMBERS' for kind in SENSORS)}"
             raise InputError.of(f"--sensor {text}", expected=expected)
@@ -105,7 +107,7 @@ def run(given: PlanOptions) -> None:
 def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
     """The robot, and the markers (P, 3) on its tip, m."""
     robot = load_robot(given.robot or Path(), given.links)
-    numbers = [_numbers("--marker", text, (3,)) for text in given.marker or ()]
+    numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
     places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
     return robot, places / table.per_metre if numbers else places
 
@@ -115,12 +117,12 @@ def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
     scale = table.per_metre
     found: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
     if cell.tracker is not None:
-        x, y, z, *seen = _numbers("--tracker", cell.tracker, (3, 6, 7))
+        x, y, z, *seen = stated_numbers("--tracker", cell.tracker, (3, 6, 7))
         looks = (seen[:3], *map(radians, seen[3:])) if seen else ()
         how: dict[str, Any] = dict(zip(("direction", "half_angle"), looks, strict=False))
         found["tracker"] = Tracker((x / scale, y / scale, z / scale), **how)
     if cell.column is not None:
-        found["column"] = [x / scale for x in _numbers("--column", cell.column, (3, 4))]
+        found["column"] = [x / scale for x in stated_numbers("--column", cell.column, (3, 4))]
     if cell.floor is not None:
         found["floor"] = cell.floor / scale
     if cell.collisions:
@@ -136,7 +138,7 @@ def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list
         name, _, ends = text.rpartition("=")
         if not name or ends.count(":") != 1:
             raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")
-        numbers = _numbers("--range", ends.replace(":", ","), (2,))
+        numbers = stated_numbers("--range", ends.replace(":", ","), (2,))
         unit = 1 / table.joints_per_metre if not turns.get(name, True) else 1.0
         found[name] = [x * (pi / 180 if turns.get(name) and table.angle == "deg" else unit) for x in numbers]
     return found
@@ -172,15 +174,3 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
         say("these errors are expected if nothing else has changed since the fit: test that by `compare`")
     if found.assumed:
         say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
-
-
-def _numbers(option: str, text: str, counts: tuple[int, ...]) -> list[float]:
-    """Numbers separated by commas."""
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts or not all(isfinite(value) for value in values):
-        expected = f"{' or '.join(map(str, counts))} numbers, separated by {'a colon' if 2 in counts else 'commas'}"
-        raise InputError.of(f"{option} {text}", expected=expected, fix="write decimal points in numbers")
-    return values

@@ -24,10 +24,10 @@ from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outsi
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_configurations
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
-from diffeo_calib.measurements.table_format import TableFormat, options_of
+from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
 
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
@@ -103,8 +103,7 @@ def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     written, units = table.for_writing(rotation_std=False, prefixes=prefixes), table.joints_only(())
     position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
     turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
-    none = dict.fromkeys(("payload", "time", "temperature"))
-    return shlex.join(options_of(replace(units, position=position, **turned, **none)))
+    return shlex.join(options_of(replace(units, position=position, **turned, **dict.fromkeys(BESIDE))))
 
 
 def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, masses: Tensor | None) -> Predictions:

@@ -13,8 +13,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import Hideable, repeated
-from diffeo_calib.measurements.csv.expressions import JointExpressions
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
     Names,
@@ -128,8 +127,8 @@ class Columns:
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
         markers = len(table.triples)
         _check_frames(table, markers)
-        if table.payload is not None:
-            column_names("payload", [table.payload], "the name of a column", (1,))
+        for name, column in table.beside.items():
+            column_names(name, [column], "the name of a column", (1,))
         std = _std_names(table.std, markers)
         given = table.joints
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
@@ -168,8 +167,8 @@ class Columns:
             "points": Group(flat_names(self.triples), table.length),
             "rotations": Group(self.rotation),
         }
-        found |= {name: Group((column,)) for name, column in table.covariates.items()}
-        found |= {} if table.payload is None else {"payload": Group((table.payload.strip(),), None, MASS)}
+        checks = {"payload": MASS}
+        found |= {name: Group((column.strip(),), None, checks.get(name)) for name, column in table.beside.items()}
         found["std"] = Group(self.std, table.length, DEVIATION)
         found["rotation_std"] = Group(self.rotation_std, self.rotation_unit, DEVIATION)
         own = [group for one in self.readings for group in (one.values, one.std)]
@@ -212,8 +211,7 @@ class Columns:
         """Convert rows (N, c) in the file's units, columns in the order of ``names``.
 
         Returns:
-            q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), payload and covariates (N,), others
-            (N, c).
+            q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), those beside them (N,), others (N, c).
         """
         found, count = self._parts(raw), len(self.triples)
         values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
@@ -223,7 +221,7 @@ class Columns:
         for name in {"points", "std", "rotation_std"} & {*values}:
             each = 3 if values[name].shape[1] == 3 * count else 1  # or one per marker, or for all
             values[name] = values[name].reshape(len(raw), -1, each).expand(len(raw), count, 3)
-        return values | {name: values[name][:, 0] for name in {"payload", *table.covariates} & {*values}}
+        return values | {name: values[name][:, 0] for name in table.beside}
 
     def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
         """The cells of columns by name, of values in SI by what they are."""

@@ -7,7 +7,6 @@ Every mistake in a file is one error that names the file, the line and the colum
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -20,9 +19,9 @@ from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
-from diffeo_calib.measurements.checks import file_sha256
+from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import (
     FileRows,
     ReadingColumns,
@@ -248,8 +247,7 @@ def read_configurations(
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
     """The poses (N, 4, 4), or places (N, k), m, to which a machine was commanded."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numbers of rotations are read as angles
+    with quiet():  # numbers of rotations are read as angles
         cells = read_joints(path, replace(columns, robot=None), replace(table, angle="rad", joint_length=None))
     try:
         poses = replace(columns, angle=table.angle).poses(cells)

@@ -41,23 +41,19 @@ class ImageColumns(SensorColumns):
 
     @property
     def texts(self) -> Mapping[str, bool]:
-        """See :class:`SensorColumns`."""
         return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
 
     def reported(self, table: TableFormat) -> tuple[Reported, ...]:
-        """See :class:`SensorColumns`."""
         return tuple(Reported(group, Group(()), self.word) for group in (Group(POINT, table.length), Group(PIXEL)))
 
     def filled(self, rows: FileRows) -> Tensor:
-        """See :class:`SensorColumns`."""
         return rows.filled(IMAGE)
 
     def own_lines(self, rows: FileRows) -> FileRows:
-        """See :class:`SensorColumns`: the first line of every image."""
+        """The first line of every image."""
         return rows.of(torch.tensor([own[0] for own in self._images(rows).values()], dtype=torch.int64, device=HOST))
 
     def table(self, rows: FileRows) -> Measurements:
-        """See :class:`SensorColumns`."""
         images = self._images(rows)
         _check_joints(rows, images)
         points, pixels = (rows.values[one.values] for one in self.reported(rows.columns.table))
@@ -78,7 +74,7 @@ class ImageColumns(SensorColumns):
         return data if set_ups is None else data.with_sessions(set_ups)
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        """See :class:`SensorColumns`: a line for each corner."""
+        """A line for each corner."""
         number, corner = (~part.corners[..., 0].isnan()).nonzero().unbind(1)
         seen, whose = part.corners[number, corner], number.tolist()
         texts = {IMAGE: [str(k) for k in whose]}

@@ -122,20 +122,18 @@ class PositionColumns(SensorColumns):
 
     @property
     def texts(self) -> Mapping[str, bool]:
-        """See :class:`SensorColumns`."""
         own = self.form.session, self.form.marker and self.form.marker.partition("=")[0]
         return {name: True for name in own if name is not None}
 
     def filled(self, rows: FileRows) -> Tensor:
-        """See :class:`SensorColumns`."""
         return ~rows.values["points"].isnan().flatten(1).all(1)
 
     def own_lines(self, rows: FileRows) -> FileRows:
-        """See :class:`SensorColumns`: the first line of every row."""
+        """The first line of every row."""
         return self._with_markers(rows)[0]
 
     def table(self, rows: FileRows) -> Measurements:
-        """See :class:`SensorColumns`; MeasurementError for numbers that do not form a rotation."""
+        """MeasurementError for numbers that do not form a rotation."""
         rows, names = self._with_markers(rows)
         values, columns, table = rows.values, rows.columns, rows.columns.table
         std, turns = values.get("std"), values.get("rotation_std")
@@ -186,7 +184,6 @@ class PositionColumns(SensorColumns):
         return of_rows, names
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        """See :class:`SensorColumns`."""
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
         values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
         if frames is not None:
@@ -232,18 +229,15 @@ class SocketColumns(SensorColumns):
 
     @property
     def texts(self) -> Mapping[str, bool]:
-        """See :class:`SensorColumns`."""
         if not self.names:
             fix = "pass ['place', 'socket']"
             raise MeasurementError.of("`socket`", expected="names of columns", got="none", fix=fix)
         return dict.fromkeys(self.names, True)
 
     def filled(self, rows: FileRows) -> Tensor:
-        """See :class:`SensorColumns`."""
         return torch.stack([rows.filled(name) for name in self.names]).any(0)
 
     def table(self, rows: FileRows) -> Measurements:
-        """See :class:`SensorColumns`."""
         fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
@@ -252,7 +246,6 @@ class SocketColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on])
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        """See :class:`SensorColumns`."""
         return {}, {self.names[0]: part.row_sockets}, *part.index
 
 
@@ -303,23 +296,19 @@ class ReadingColumns(SensorColumns):
 
     @property
     def word(self) -> str:
-        """See :class:`SensorColumns`."""
         return "an image" if self.kind == "image" else f"a {self.kind}"
 
     @property
     def texts(self) -> Mapping[str, bool]:
-        """See :class:`SensorColumns`."""
         return {} if self.device is None else {self.device: True}
 
     def reported(self, table: TableFormat) -> tuple[Reported, ...]:
-        """See :class:`SensorColumns`."""
         unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
         check = LENGTH if self.kind == "distance" and not self.offset_std else None
         names = self.values if isinstance(self.values, tuple) else ()
         return (Reported(Group(names, unit, check), Group(self.std, unit, DEVIATION), self.word),)
 
     def filled(self, rows: FileRows) -> Tensor:
-        """See :class:`SensorColumns`."""
         if isinstance(self.values, tuple):
             return ~rows.values[self.reported(rows.columns.table)[0].values].isnan().any(1)
         if self.device is None:
@@ -328,7 +317,6 @@ class ReadingColumns(SensorColumns):
         return rows.filled(self.device)
 
     def table(self, rows: FileRows) -> Readings:
-        """See :class:`SensorColumns`."""
         q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
         (own,) = self.reported(table)
         if isinstance(self.values, tuple):
@@ -350,7 +338,6 @@ class ReadingColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on])
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        """See :class:`SensorColumns`."""
         (own,) = self.reported(table)
         values = {own.values: part.reported} | ({own.std: part.reported_std} if self.std else {})
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index

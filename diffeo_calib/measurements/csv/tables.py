@@ -25,8 +25,8 @@ from diffeo_calib.measurements.csv.cells import (
     numbers_in,
 )
 from diffeo_calib.measurements.csv.columns import Columns, Values
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
-from diffeo_calib.measurements.csv.pose_columns import PoseColumns
 from diffeo_calib.measurements.poses import ANGLE_UNITS
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, options_of
 

@@ -162,7 +162,7 @@ def _cell(value: str | float, table: TableFormat) -> str:
     return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
 
-SOCKET, SESSION, PAYLOAD = "socket", "session", "payload"
+SOCKET, SESSION = "socket", "session"
 """Names of columns that are written."""
 
 
@@ -249,12 +249,11 @@ def _sheet(whole: Observations, table: TableFormat) -> TableFormat:
         position = table.position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes]
         on = device.on and list(device.bodies.tips(device.on))
         table = _with_names(device, replace(table, position=position, remounted=device.remounted, on=on))
-    if whole.payload is not None and table.payload is None:
-        table = replace(table, payload=PAYLOAD)
-    covariates = {name: getattr(table, name) or name for name in whole.covariate_names}
+    known = [*whole.covariate_names, *["payload"] * (whole.payload is not None)]
+    beside = {name: getattr(table, name) or name for name in known}
     own = session if device is not None and device.session is not None else None
     readings = _reading_columns(whole, session)
-    return replace(table, **covariates, sockets=_socket_columns(whole), readings=readings, session=own)
+    return replace(table, **beside, sockets=_socket_columns(whole), readings=readings, session=own)
 
 
 def _sensors(whole: Observations, table: TableFormat) -> list[SensorColumns]:

@@ -34,8 +34,7 @@ from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
-from diffeo_calib.reports.analysis.predictions import Predictions
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,7 +18,9 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.kinematics.nominal import SessionMarkers
+from diffeo_calib.measurements.checks import quiet
+from diffeo_calib.reports.analysis.predictions import FitRows
 
 Kinematics = Callable[[Tensor], Tensor]
 
@@ -32,11 +33,11 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     and markers are those that fit the model best.
     """
     rows = FitRows(model) if rows is None else rows
-    if not rows.in_one_place or model.registration is not None or model.rigid_errors is None:
+    mounted_anew = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
+    if not rows.known or mounted_anew or model.registration is not None or model.rigid_errors is None:
         geometries = nominal_kinematics(model).geometry, geometric_kinematics(model).geometry
     else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they were shown when the model was fitted
+        with quiet():  # they were shown when the model was fitted
             registered = register_robustly(model.robot, rows.measurements).geometry
             geometries = registered, identify(registered, rows.q, rows.points).geometry
     return {NOMINAL: geometries[0].points, GEOMETRIC: geometries[1].points, CALIBRATED: model}

@@ -16,8 +16,7 @@ from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings, OwnErrors
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.predictions import Predictions
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sentences

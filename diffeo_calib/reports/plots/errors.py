@@ -13,7 +13,6 @@ from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.stages import stages_of
 from diffeo_calib.reports.plots.style import BLUE, FAINT, GREY, INK, LOOKS, finish, legend, literal, note, panels
@@ -107,8 +106,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
         model: a calibrated model. data: rows that took no part in its fit; by default the rows of the fit.
         title: of the figure.
     """
-    rows = FitRows(model)
-    seen = Predictions.of_fit(rows) if data is None else Predictions.of(model, data)
+    seen = Predictions.of(model, data)
     geometric = seen.data.bodies.origins(stages_of(model)[GEOMETRIC](seen.data.q))
     there = ~seen.measured.isnan().any(2)  # of the sightings
     places, before, after = seen.measured[there], (seen.measured - geometric)[there], seen.away[there]

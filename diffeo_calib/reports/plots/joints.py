@@ -14,7 +14,7 @@ from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
-from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree
@@ -30,7 +30,7 @@ HISTOGRAM_BINS = 24
 """Intervals of the measured values below it."""
 WIDE_RATIO = 20.0
 """Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
-FEWEST_IN_BIN = 3
+BINS, FEWEST_IN_BIN = 10, 3
 PART_WIDTH = 4.7
 """Width of the figure of the parts, inches."""
 TWO_SIDED_95 = 1.96
@@ -130,15 +130,13 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key
         legend(axes, loc="upper left", ncols=2)
 
 
-def in_bins(
-    values: Tensor, lengths: Tensor, bins: int = 10, fewest: int = FEWEST_IN_BIN
-) -> tuple[list[float], list[Tensor]]:
+def in_bins(values: Tensor, lengths: Tensor) -> tuple[list[float], list[Tensor]]:
     """Middles of intervals of values, and the lengths there: not a number where there are fewer than three."""
-    edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype, device=values.device)
+    edges = torch.linspace(float(values.min()), float(values.max()), BINS + 1, dtype=values.dtype, device=values.device)
     number = torch.bucketize(values, edges[1:-1])
-    groups = [lengths[number == k] for k in range(bins)]
-    middles = [float(edges[k : k + 2].mean()) for k in range(bins)]
-    return middles, [group if len(group) >= fewest else group.new_tensor([nan]) for group in groups]
+    groups = [lengths[number == k] for k in range(BINS)]
+    middles = [float(edges[k : k + 2].mean()) for k in range(BINS)]
+    return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
 
 
 def short(name: str) -> str:

@@ -10,8 +10,7 @@ from torch import Tensor
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
+from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions
 from diffeo_calib.reports.plots.joints import in_bins, joint_label, joint_values
 from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, dots, finish, legend, note, panels
 from diffeo_calib.sensors.errors import Evaluation
@@ -33,7 +32,7 @@ def uncertainty(model: CalibratedKinematics, data: Measurements | None = None, t
         title: of the figure.
     """
     figure, (axes,) = panels(1, title=title)
-    draw_coverage(axes, _predictions(model, data))
+    draw_coverage(axes, Predictions.of(model, data))
     return figure
 
 
@@ -56,7 +55,7 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
 
 def residuals(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
     """Errors against row and every joint; arguments as :func:`uncertainty`."""
-    predictions = _predictions(model, data)
+    predictions = Predictions.of(model, data)
     figure, grid = panels(1 + model.robot.n, columns=3, title=title)
     draw_residuals(grid[0], predictions.data.line_numbers.double(), predictions.errors, "row")
     for joint, axes in enumerate(grid[1:]):
@@ -109,7 +108,3 @@ def draw_learning_curve(
         axes.axhline(1e3 * limit, color=ORANGE, ls="--", lw=1.2, label="repeatability")
     finish(axes, x="rows", y="RMS error [mm]", logarithmic="xy")
     legend(axes, loc="upper right")
-
-
-def _predictions(model: CalibratedKinematics, data: Measurements | None) -> Predictions:
-    return Predictions.of_fit(FitRows(model)) if data is None else Predictions.of(model, data)
