@@ -24,8 +24,8 @@ ROLES = {
     "rate": "vel velocity velocities speed qd dq qdot dot acc accel acceleration qdd ddq gyro imu tau torque torques "
     "effort moment force wrench ft current currents voltage volt power temp temperature mode control window momentum "
     "load pressure status nm strom drehmoment geschwindigkeit vitesse couple",
-    "turn": "rot rotation euler quat quaternion ang angle angles orientation ori rotvec rpy phi q",
-    "place": "t p pos position trans translation point",
+    "turn": "rot rotation euler quat quaternion ang angle angles orientation ori rotvec rvec rpy phi q",
+    "place": "t p pos position trans translation tvec point",
     "tool": "tcp pose ee cartesian cart tool marker point",
     "joint": "q j joint joints jnt axis axes ax a rax achse gelenk theta th qpos jpos pos position positions angle "
     "angles state states",

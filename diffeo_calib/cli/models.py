@@ -58,7 +58,8 @@ def robot_of(given: Robot, source: MeasuredTable) -> Tree:
         return cartesian(read_poses(source.csv, source.joints, source.table))
     if given.robot is None:
         expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
-        raise InputError.of("the robot", expected=expected, got="neither")
+        fix = "of several lines that a campaign file proposes, uncomment one"
+        raise InputError.of("the robot", expected=expected, got="neither", fix=fix)
     return load_robot(given.robot, given.links)
 
 

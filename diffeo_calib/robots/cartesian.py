@@ -22,7 +22,8 @@ from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.robots.tree import Chain, Tree
 
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
-"""Names of the joints."""
+PLACES = SLIDES[:1], SLIDES[:2], SLIDES
+"""Names of the joints; and those of places."""
 BEYOND, LEAST_BEYOND_RAD = 0.25, 0.35
 """Limits lie beyond the poses by this share of their range; of turns at least by so much."""
 FLAT, STEEPEST = 0.8, 0.97
@@ -55,7 +56,12 @@ def cartesian(poses: object) -> Chain:
 
 def is_cartesian(robot: Tree) -> bool:
     """Whether the inputs of a robot are numbers of poses."""
-    return robot.joint_names in (SLIDES[:1], SLIDES[:2], SLIDES, (*SLIDES, *TURNS))
+    return robot.joint_names in (*PLACES, (*SLIDES, *TURNS))
+
+
+def turns_nowhere(robot: Tree) -> bool:
+    """Whether commands are places: no row tells a marker's place on the machine from that of the base."""
+    return robot.joint_names in PLACES
 
 
 def pose_inputs(robot: Tree, poses: object) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from commanded_bank import flange
 from product_bank import ur10_measurements
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify, least_squares_of
@@ -226,3 +227,5 @@ def test_the_joints_of_commanded_poses_have_no_errors(axes: int) -> None:
     assert float(found.theta[joints].abs().max()) == 0.0
     assert float(found.deviations[joints].max()) == 0.0
     assert float(found.deviations[geometry.slices["base"]].min()) > 1e-5
+    first = register(machine, q, geometry.points(q)).geometry.tool
+    assert_close(first, geometry.tool if axes == 6 else 0.0 * geometry.tool)  # where it sits is in the base

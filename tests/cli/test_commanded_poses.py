@@ -195,6 +195,24 @@ def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, command: Command)
     assert '# length = "mm"' in text
 
 
+def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command) -> None:
+    commanded = flange()
+    measured = seen(commanded, camera_on_tool=False)
+    turns = [rotation_numbers(own[:, :3, :3], "rotvec") for own in (commanded, measured)]
+    poses = {"TCP_x|TCP_y|TCP_z": commanded[:, :3, 3], "TCP_rx|TCP_ry|TCP_rz": turns[0]}
+    poses |= {"tvec_x|tvec_y|tvec_z": measured[:, :3, 3], "rvec_x|rvec_y|rvec_z": turns[1]}
+    table = write_columns(tmp_path / "t.csv", **poses)
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    text = (tmp_path / "c.toml").read_text(encoding="utf-8")
+    assert 'rotation = "rvec_x,rvec_y,rvec_z"' in text
+    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
+    assert done.code == 0, done.error
+    found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["results"]["hand_eye"]
+    for name, truth in (("camera_in_base", BOARD), ("board_in_tip", CAMERA)):
+        away = torch.tensor(found[name]["pose_m"], dtype=torch.float64)[:3, 3] - truth[:3, 3]
+        assert bool((away.abs() < 4 * torch.tensor(found[name]["position_std_m"])).all())
+
+
 def test_two_markers_of_a_machine_with_commanded_places(tmp_path: Path, command: Command) -> None:
     commanded = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     markers = {"left_x|left_y|left_z": bent(commanded), "right_x|right_y|right_z": bent(commanded) + 0.1}
@@ -285,6 +303,7 @@ def test_a_function_in_place_of_a_robot(
     header, *rows = cells(tmp_path / "c.csv")
     assert {row[header.index("status")] for row in rows} == {"reached"}
     corrected = [[float(row[header.index(axis)]) for axis in "xyz"] for row in rows]
+    assert "q1" not in header  # of the program before
     again = write_columns(tmp_path / "again.csv", x_y_z=torch.tensor(corrected, dtype=torch.float64))
     places = ["--robot-pose", "x,y,z", "--length", "mm", "--angle", "deg"]
     assert command("predict", model, again, *places, "-o", tmp_path / "a.csv").code == 0

@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.process.tails import Tails, reweight
-from diffeo_calib.robots.cartesian import is_cartesian
+from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
@@ -133,12 +133,17 @@ class Identification:
 def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
     """Numbers of the parameters that stay zero.
 
-    Errors between the joints of a commanded pose, which are numbers and no links; and, ``adrift`` without a measuring
-    device, where the robot stands and its first joint, which no row tells apart.
+    Errors between the joints of a commanded pose, which are numbers and no links. Of parts that no row tells apart one:
+    ``adrift`` without a measuring device, where the robot stands, and its first joint; with one, where the first marker
+    of a machine with commanded places sits.
     """
-    base, joints = (range(geometry.size)[geometry.slices[name]] for name in ("base", "joints"))
-    of_numbers = joints if is_cartesian(geometry.chain) else range(0)
-    return tuple(sorted({*of_numbers, *base, *joints[:6]} if adrift else of_numbers))
+    base, joints, tool = (range(geometry.size)[geometry.slices[name]] for name in ("base", "joints", "tool"))
+    held = {*joints} if is_cartesian(geometry.chain) else set[int]()
+    if adrift:
+        held |= {*base, *joints[:6]}
+    elif turns_nowhere(geometry.chain):
+        held |= {*tool[:3]}
+    return tuple(sorted(held))
 
 
 def identify(

@@ -32,6 +32,7 @@ from diffeo_calib.calibration.identification.identification import (
     MeasuredPoints,
     Prior,
     Rows,
+    held_parameters,
     identify,
     in_mm,
     solve,
@@ -42,8 +43,10 @@ from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.robots.cartesian import turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, PLACES, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.devices import median_weights
@@ -82,7 +85,10 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
         what, fix = f"{len(q)} rows never show marker {never}", "measure rows that show it, or leave it out"
         raise MeasurementError.of(what, expected="every marker in some rows", fix=fix)
     found = place(bare.marker_poses(q), points)
-    return _registered(replace(bare, base=found.base, tool=found.tool), q, points, found.iterations)
+    base, tool = found.base, found.tool
+    if turns_nowhere(chain):  # where the first marker sits belongs to the base
+        base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype), tool[0]), tool - tool[0]
+    return _registered(replace(bare, base=base, tool=tool), q, points, found.iterations)
 
 
 def can_register(points: Tensor) -> bool:
@@ -94,7 +100,8 @@ def can_register(points: Tensor) -> bool:
 def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
     """Residual, covariance and status of a registration."""
     parts = geometry.slices
-    places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
+    held, every = held_parameters(geometry), range(geometry.size)
+    places = [number for number in (*every[parts["base"]], *every[parts["tool"]]) if number not in held]
     sought = torch.tensor(places, dtype=torch.int64, device=q.device)
     rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
     slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
@@ -107,7 +114,7 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     error = points.new_full(points.shape[:2], max(noise, LIMITS.smallest_noise_m) * sqrt(count))
     places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
     prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m)
-    root = prior.root(geometry, range(geometry.size)[parts["joints"]])
+    root = prior.root(geometry, [*every[parts["joints"]], *held])
     own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0))
     covariance = solve(Rows(geometry, (own,)), error, root, max_nfev=1).covariance
     done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"

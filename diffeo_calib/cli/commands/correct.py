@@ -91,6 +91,7 @@ def run(options: CorrectOptions) -> None:
     sheet = Program.read(program, table, columns.names)
     if isinstance(names, PoseColumns) and names.is_program:
         columns = Columns.of(table.joints_only(written_columns(names), robot.kinds))
+        sheet = sheet.without(names.columns)  # they would be those of the program before
         sheet.check_free(columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4
@@ -119,10 +120,8 @@ def run(options: CorrectOptions) -> None:
     for tool, each in zip(tools, known, strict=False):
         say(_how_well_known(tool, *each, where))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
-    say(
-        f"{len(found)} rows written to {output}: corrected joints, the pose to command ({frames}), status, miss and "
-        "standard deviation"
-    )
+    corrected = f"{len(found)} rows written to {output}: corrected {', '.join(columns.names)}"
+    say(f"{corrected}, the pose to command ({frames}), status, miss and standard deviation")
 
 
 def _check(options: CorrectOptions) -> None:

@@ -25,6 +25,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_joints
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
@@ -97,6 +98,8 @@ def run(given: PlanOptions) -> None:
     if isinstance(source, CalibratedKinematics):
         say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
         say(*expectation_lines(source, None))
+    if isinstance(names, PoseColumns) and cell.candidates is None:
+        say("poses are drawn around those of the fit: pass --candidates where the machine, or the view, is smaller")
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:

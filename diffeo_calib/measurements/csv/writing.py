@@ -134,6 +134,11 @@ class Program:
         header, lines = read_cells(path, table.sep, wanted)
         return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
 
+    def without(self, names: Sequence[str]) -> Program:
+        """The same without some columns."""
+        kept = [k for k, name in enumerate(self.header) if name not in names]
+        return Program([self.header[k] for k in kept], [[row[k] for k in kept] for row in self.rows], self.lines)
+
     def check_free(self, names: Sequence[str]) -> None:
         """Raise MeasurementError if a column that is to be added is there already."""
         taken = [name for name in names if name in self.header]
