@@ -291,6 +291,8 @@ def _(bench: Bench) -> None:
         assert_close(one, other, rtol=0, atol=1e-12)
     else:
         check_accuracy(kind, model, NEW_ROWS_FACTOR)
+    if kind.name in THROUGHOUT:  # in the new frame
+        assert 1e3 * evaluations(dc.evaluate(model, kind.moved))[0].rms < 2 * kind.source.worst_mm
 
 
 # --- queries --------------------------------------------------------------------------------------------------------

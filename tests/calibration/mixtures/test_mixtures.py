@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from mixture_bank import TRACKED
-from product_bank import usual_scales
 from simulated_sockets import SocketRows
 from torch import Tensor
 
@@ -32,8 +31,9 @@ CHI2_3 = 7.815
 
 
 @pytest.fixture(scope="module")
-def scales(arm: SimulatedArm) -> dc.Hyperparameters:
-    return replace(usual_scales(arm.nominal), other_noise=torch.tensor(2e-5, dtype=torch.float64))
+def scales(arm: SimulatedArm, tracked: dc.Measurements) -> dc.Hyperparameters:
+    noise = torch.tensor(2e-5, dtype=torch.float64)
+    return replace(dc.calibrate(arm.nominal, tracked).selection.scales, other_noise=noise)
 
 
 @pytest.fixture(scope="module")
