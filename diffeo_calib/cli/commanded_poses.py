@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
-from math import inf
+from itertools import pairwise, product
+from math import inf, nan
 from pathlib import Path
 
 import torch
@@ -20,8 +20,10 @@ from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
-from diffeo_calib.measurements.csv.files import read_joints, read_poses
+from diffeo_calib.measurements.csv.cells import numbers_in
+from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
@@ -35,6 +37,8 @@ MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 MOST_WAYS = 24
 """Ways to read the rows that are tried with a registration."""
+SMALLEST_M = 1e-9
+"""Mean motion of a flange that turns at one place."""
 RANK = 1e-6
 """Directions of X whose squares are smaller than this share of the largest are open: those along a single axis."""
 ALIKE = 6.0
@@ -43,7 +47,7 @@ ALIKE = 6.0
 
 @dataclass(frozen=True)
 class Body:
-    """Columns of a place, and of the rotation behind it, if any."""
+    """Columns of a place, and of the rotation beside it, if any."""
 
     place: list[str]
     turn: list[str]
@@ -63,16 +67,22 @@ class Reading:
 
 
 def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
-    """Places with the rotations that follow them, and poses as 6, 7, 12 or 16 numbers, in the order of the columns."""
+    """Places with the rotations behind or before them, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
     at = {name: number for number, name in enumerate(sheet.header)}
     triples = [group for group in whole(sheet.numbers, "xyz") if not group.says("rate", "deviation", "turn")]
     places = sorted((list(group.names.values()) for group in triples), key=lambda own: at[own[0]])
-    found, starts = list[Body](), [*(at[own[0]] for own in places), len(sheet.header)]
-    for own, end in zip(places, starts[1:], strict=True):
-        behind = [name for name in sheet.header[at[own[0]] : end] if name in sheet.numbers and name not in own]
-        turns = [group for labels, _ in ROTATIONS for group in whole(behind, labels)]
+    ends = [0, *(at[own[0]] for own in places), len(sheet.header)]
+
+    def turn(own: Sequence[str], start: int, end: int) -> list[str]:
+        between = [name for name in sheet.header[start:end] if name in sheet.numbers and name not in own]
+        turns = [group for labels, _ in ROTATIONS for group in whole(between, labels)]
         turns = [list(group.names.values()) for group in turns if not group.says("rate", "deviation")]
-        found.append(Body(own, turns[0] if turns else []))
+        return turns[0] if turns else []
+
+    behind = [turn(own, *own_ends) for own, own_ends in zip(places, pairwise(ends[1:]), strict=True)]
+    before = [turn(own, *own_ends) for own, own_ends in zip(places, pairwise(ends[:-1]), strict=True)]
+    first = bool(places) and bool(before[0]) and not behind[-1]
+    found = [Body(own, turns) for own, turns in zip(places, before if first else behind, strict=True)]
     used = {name for own in found for name in (*own.place, *own.turn)}
     while matrix := matrix_in(csv, sheet, [name for name in sheet.numbers if name not in used]):
         found.append(Body(*(list(names) for names in matrix)))
@@ -87,9 +97,15 @@ def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
-    """That of the machine: by words of the names, reported ones before wished ones; else the first."""
+    """That of the machine: by words of the names, reported ones before wished ones; else the first.
+
+    What is only said to be measured is the machine's where something else was seen as well.
+    """
+    others = any(own.words & WORDS["seen"] for own in bodies)
 
     def rank(own: Body) -> int:
+        if others and own.words & WORDS["measured"] and not own.words & WORDS["seen"]:
+            return 3
         if own.words & WORDS["machine"]:
             return 2 + bool(own.words & WORDS["measured"])
         return bool(own.words & (WORDS["wished"] - {"target"})) - len(own.words & (WORDS["seen"] | WORDS["measured"]))
@@ -149,7 +165,7 @@ def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterato
     yield from entries(sized, length=size)
     yield from entries(tables, joint_length=size, angle=why)
     if tables[0].rotation is not None:
-        yield Choice("rotation", ",".join(map(str, tables[0].rotation)), "behind the columns of its place")
+        yield Choice("rotation", ",".join(map(str, tables[0].rotation)), "beside the columns of its place")
         yield from entries(tables, convention=why, rotation_angle="the same")
     yield from entries(tables, camera_on_tool="what stands is seen from the flange")
 
@@ -158,12 +174,14 @@ def _read(
     csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None
 ) -> Iterator[tuple[float, Source]]:
     """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
-    turn, seen_at = ([], None) if body is None else (body.turn, _numbers(csv, sheet, body.place))
-    commanded_at = _numbers(csv, sheet, machine.place)
+    turn, place = ([], []) if body is None else (body.turn, body.place)
+    groups = machine.place, machine.turn, place, turn
+    numbers = _numbers(csv, sheet, [name for names in groups for name in names])
+    commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
     length = _lengths(machine.place, commanded_at)[0]
-    other = length if body is None or seen_at is None else _lengths(body.place, seen_at)[0]
-    own, seen = (_readings(_numbers(csv, sheet, names)) for names in (machine.turn, turn))
-    if own and seen and commanded_at is not None and seen_at is not None:
+    other = _lengths(place, seen_at)[0] if place else length
+    own, seen = _readings(commanded_turn), _readings(seen_turn)
+    if own and seen:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
     else:
@@ -181,28 +199,27 @@ def _read(
             yield source.residual(table), source
 
 
-def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor | None:
-    """Columns as they are (N, c); None without any, or with empty cells."""
-    if not names:
-        return None
-    with quiet(), suppress(DiffeoCalibError):
-        return read_joints(csv, list(names), TableFormat("m", "rad", sheet.sep, sheet.decimal))
-    return None
+def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor:
+    """Columns as they are (N, c), of the rows without an empty cell among them."""
+    header, lines = read_cells(csv, sheet.sep, names)
+    columns = [numbers_in([cells[header.index(name)] for _, cells in lines], sheet.decimal) for name in names]
+    found = torch.tensor([[nan if value is None else value for value in own] for own in columns], dtype=torch.float64)
+    return found[:, found.isfinite().all(0)].T
 
 
-def _lengths(names: Sequence[str], values: Tensor | None) -> tuple[str, ...]:
+def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     """Units of lengths that places may have, by their names, else by the size of the numbers; the likeliest first."""
     named = {column(name).unit for name in names} - {""}
     if len(named) == 1:
         return (named.pop(),)
-    largest = 0.0 if values is None else float(values.abs().max())
+    largest = float(values.abs().max()) if values.numel() else 0.0
     return ("mm",) if largest > LARGEST_IN_METRES else ("m",) if largest < SURELY_METRES else ("m", "mm")
 
 
-def _readings(numbers: Tensor | None) -> dict[Reading, Tensor]:
+def _readings(numbers: Tensor) -> dict[Reading, Tensor]:
     """Rotations (N, 3, 3) in every convention that can be meant."""
     found = dict[Reading, Tensor]()
-    count = 0 if numbers is None else numbers.shape[1]
+    count = numbers.shape[1]
     for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == count):
         for angle in ("deg", "rad") if count == 3 else ("rad",):
             with suppress(InputError):
@@ -235,7 +252,8 @@ def _alike(
         right = torch.einsum("abij,bkj->abki", X, u) - t[:, None]
         shift = torch.einsum("aij,abj->abi", torch.linalg.pinv(G.flatten(1, 2)), right.flatten(2))
         moved = (torch.einsum("akij,abj->abki", G, shift) - right).square().sum(3).mean(2)
-        left = turned.square().sum((3, 4)).mean(2).sqrt() + (moved / t.square().sum(2).mean(1)[:, None]).sqrt()
+        size = t.square().sum(2).mean(1)[:, None].clamp(min=SMALLEST_M**2)
+        left = turned.square().sum((3, 4)).mean(2).sqrt() + (moved / size).sqrt()
         each = product(commanded[1], seen[1])
         found += [(float(size), (*pair, camera)) for size, pair in zip(left.flatten(), each, strict=True)]
     found.sort(key=lambda entry: entry[0])
@@ -256,12 +274,12 @@ def _conjugation(R: Tensor, t: Tensor, S: Tensor, u: Tensor) -> Tensor:
     Args:
         R: (K, 3, 3) and t: (K, 3), m, of A. S: (b, K, 3, 3) and u: (b, K, 3), m, of b readings of B.
     """
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    eye, size = torch.eye(3, dtype=R.dtype, device=R.device), t.norm(dim=1).mean().clamp(min=SMALLEST_M)
     turns = torch.einsum("kip,jq->kijpq", R, eye) - torch.einsum("ip,bkqj->bkijpq", eye, S)
-    shifts = torch.einsum("ip,bkq->bkipq", eye, u) / t.norm(dim=1).mean()
-    by_shift = ((eye - R) / t.norm(dim=1).mean()).expand(len(S), -1, -1, -1).flatten(1, 2)  # (b, 3 K, 3)
+    shifts = torch.einsum("ip,bkq->bkipq", eye, u) / size
+    by_shift = ((eye - R) / size).expand(len(S), -1, -1, -1).flatten(1, 2)  # (b, 3 K, 3)
     rows = torch.cat([shifts.flatten(3).flatten(1, 2), by_shift], 2)
     rows = torch.cat([torch.nn.functional.pad(turns.flatten(4).flatten(1, 3), (0, 3)), rows], 1)  # (b, 12 K, 12)
-    wanted = torch.cat([t.new_zeros(9 * len(t)), (t / t.norm(dim=1).mean()).flatten()])
+    wanted = torch.cat([t.new_zeros(9 * len(t)), (t / size).flatten()])
     found = torch.linalg.pinv(rows.mT @ rows, rtol=RANK, hermitian=True) @ (rows.mT @ wanted)[..., None]
     return nearest_rotations(found[:, :9, 0].unflatten(1, (3, 3)))

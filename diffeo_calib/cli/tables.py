@@ -282,8 +282,11 @@ class ProgramTable:
         return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:
-        """The format of the poses that are written: the same convention, a rotation vector without one."""
-        plain = replace(self.table, convention=self.given.convention, rotation_angle=self.given.rotation_angle)
+        """The format of the poses that are written: the same convention, by default that of commanded poses."""
+        convention, angle = self.given.convention, self.given.rotation_angle
+        if convention is None and isinstance(self.joints, PoseColumns) and not self.joints.is_program:
+            convention, angle = self.joints.convention or None, angle or self.table.angle
+        plain = replace(self.table, convention=convention, rotation_angle=angle)
         return plain.for_writing(rotation_std=False)
 
 

@@ -24,8 +24,9 @@ from diffeo_calib.robots.tree import Chain, Tree
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
 PLACES = SLIDES[:1], SLIDES[:2], SLIDES
 """Names of the joints; and those of places."""
-BEYOND, LEAST_BEYOND_RAD = 0.25, 0.35
-"""Limits lie beyond the poses by this share of their range; of turns at least by so much."""
+BEYOND, LEAST_BEYOND, LEAST_BEYOND_RAD = 0.25, 0.01, 0.35
+"""Limits lie beyond the poses by this share of their range; of slides at least by a share of the largest range, so that
+one that stood still can be corrected; of turns at least by so much."""
 FLAT, STEEPEST = 0.8, 0.97
 """Sine of the largest b about the mean of the poses, and about any middle."""
 DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
@@ -127,6 +128,7 @@ def _chain(inputs: Tensor, middle: Tensor | None = None) -> Chain:
     inputs, eye = inputs.detach().cpu(), torch.eye(4, dtype=torch.float64, device="cpu")
     low, high = inputs.amin(0), inputs.amax(0)
     beyond = BEYOND * (high - low)
+    beyond[:3] = beyond[:3].clamp(min=LEAST_BEYOND * float((high - low)[:3].max()))
     beyond[3:] = beyond[3:].clamp(min=LEAST_BEYOND_RAD)
     ends = list(zip((low - beyond).tolist(), (high + beyond).tolist(), strict=True))
     slides = zip(SLIDES, eye[:3, :3], ends, strict=False)

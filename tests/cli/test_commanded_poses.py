@@ -72,6 +72,8 @@ def test_init_finds_what_the_numbers_mean(
 @pytest.mark.parametrize(
     ("names", "machine"),
     [
+        ("cmd_x cmd_y cmd_z actual_x actual_y actual_z board_x board_y board_z", "actual_x"),
+        ("x_soll y_soll z_soll x_ist y_ist z_ist cam_x cam_y cam_z", "x_ist"),
         ("a_x a_y a_z b_x b_y b_z", "a_x"),
         ("x_ist y_ist z_ist x_soll y_soll z_soll", "x_soll"),
         ("cam_x cam_y cam_z x y z", "x"),
@@ -381,3 +383,50 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
     new = torch.tensor([[float(cell) for cell in row[3:6]] for row in rows], dtype=torch.float64)
     z = turned(new)[:, :, 2]
     assert float((z @ z.mT).min()) < 0.97
+
+
+def test_rotations_before_places_and_rows_without_a_board(tmp_path: Path, command: Command) -> None:
+    commanded = flange()
+    found = seen(commanded, camera_on_tool=True)
+    turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (found, ("quat_xyzw",)))]
+    poses = {"RX_RY_RZ": turns[0].rad2deg(), "X_Y_Z": 1e3 * commanded[:, :3, 3]}
+    table = write_columns(tmp_path / "t.csv", **poses, qx_qy_qz_qw=turns[1], tx_ty_tz=1e3 * found[:, :3, 3])
+    lines = table.read_text(encoding="utf-8").splitlines()
+    lines[3] = ",".join([*lines[3].split(",")[:6], *[""] * 7])
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    done = command("init", table, "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.error
+    proposed = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
+    assert (proposed["robot-pose"], proposed["rotation"]) == ("X,Y,Z,RX,RY,RZ=xyz", "qx,qy,qz,qw")
+    assert proposed["camera-on-tool"]
+
+
+def test_a_flange_that_turns_at_one_place(tmp_path: Path, command: Command) -> None:
+    """No motion of the flange has a shift, which sets the scale of the others."""
+    commanded = flange()
+    commanded[:, :3, 3] = commanded[0, :3, 3]
+    found = seen(commanded, camera_on_tool=True)
+    turns = rotation_numbers(commanded[:, :3, :3], "xyz"), rotation_numbers(found[:, :3, :3], "quat_xyzw")
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0].rad2deg(), "tx_ty_tz": 1e3 * found[:, :3, 3]}
+    table = write_columns(tmp_path / "t.csv", **poses, qx_qy_qz_qw=turns[1])
+    done = command("init", table, "-o", tmp_path / "c.toml")
+    assert "Traceback" not in done.err
+    assert done.code == 0, done.error
+
+
+def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command) -> None:
+    places = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    places[:, 2] = 0.1
+    measured = bent(places) + 2e-5 * drawn(40, 3, seed=2)
+    measured[:, 2] += 3e-4 * (4.0 * places[:, 0]).sin()
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=1e3 * places, x_y_z=1e3 * measured)
+    pose = ["--robot-pose", "cmdx,cmdy,cmdz", *MEASURED]
+    done = command("fit", table, *pose, "--holdout", "0", "-o", tmp_path / "m.safetensors")
+    assert done.code in (0, 3), done.error
+    done = command(
+        "export", tmp_path / "m.safetensors", "--field", tmp_path / "f.csv", "--grid", "5x3x2", "--length", "mm"
+    )
+    assert done.code == 0, done.error
+    header, *rows = cells(tmp_path / "f.csv")
+    added = torch.tensor([float(row[header.index("add_z")]) for row in rows])
+    assert float(added.max() - added.min()) > 0.1

@@ -44,6 +44,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
@@ -228,7 +229,8 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        nominal = GeometryMap(geometry, elastic=True, payload=payload)
+        elastic = payload is not None or not is_cartesian(geometry.chain)
+        nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry, adrift=self.free)

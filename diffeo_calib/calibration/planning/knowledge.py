@@ -46,6 +46,7 @@ from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import NOISE_ADVICE, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rigid
@@ -295,7 +296,7 @@ def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: 
     """Configurations around the nominal geometry, to be measured with the usual noise."""
     on = geometry.on if len(set(geometry.on)) > 1 else None
     data = Measurements.of_points(q, geometry.points(q), on, lever)
-    nominal, sensor = GeometryMap(geometry, elastic=True), NoiseModel.of(data, residual)
+    nominal, sensor = GeometryMap(geometry, elastic=not is_cartesian(geometry.chain)), NoiseModel.of(data, residual)
     theta = q.new_zeros(nominal.parameters)
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
 
