@@ -125,7 +125,6 @@ def test_k0_is_linearised_once() -> None:
         part = data.rows(torch.tensor([3, 1]))
         part.process(scales)
         data.with_tails(Tails.none(*data.tails.weights.shape)).process(scales)
-        replace(data, y=data.y).process(scales)
         data.sample(5, 900, 0)[1].process(scales)
     assert count == dict.fromkeys(ONCE, len(data.x))
 

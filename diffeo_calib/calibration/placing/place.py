@@ -19,10 +19,9 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.labels import OtherLabel, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
+from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherRows, Placement
@@ -34,7 +33,7 @@ from diffeo_calib.calibration.placing.readings import (
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
+from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -337,16 +336,7 @@ def _by_coordinates(
     own.table.check_every_marker_seen()
     sessions, table = Sessions.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    progress("registration", 0, 1)
-    sockets = list[SocketDevices]()
-    if table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, table)
-        sockets.append(places.of_rows(own.rows, count))
-    else:
-        registration = registered(robot, table)
-        progress("geometry", 0, 1)
-        stages = registration, identify(registration.geometry, table.q, table.points)
-        check_identification(table, stages[1])
+    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])

@@ -38,6 +38,7 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
+from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
@@ -53,6 +54,7 @@ from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -303,6 +305,28 @@ class SocketDevices(DeviceSet):
             known = f", distance {errors} mm" * bool(errors)
             lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
+
+
+def coordinate_stages(
+    robot: Tree, own: Coordinates, count: int, progress: Progress
+) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
+    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
+
+    Args:
+        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
+
+    Raises:
+        MeasurementError: rows that cannot belong to this robot, or too few.
+    """
+    progress("registration", 0, 1)
+    if own.table.sockets is not None:
+        places, table, stages = stages_by_sockets(robot, own.table)
+        return [places.of_rows(own.rows, count)], table, stages
+    registration = registered(robot, own.table)
+    progress("geometry", 0, 1)
+    identification = identify(registration.geometry, own.table.q, own.table.points)
+    check_identification(own.table, identification)
+    return [], own.table, (registration, identification)
 
 
 def stages_by_sockets(
