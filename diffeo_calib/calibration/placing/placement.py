@@ -212,18 +212,18 @@ class Placement(tuple[DeviceSet, ...]):
         effects = [own.effects(data) for own in self]
         return torch.cat(effects, dim=2) if effects else None
 
-    def settled(self, fitted: Fit, around: FittedMap, *at: Tensor, **known: Any) -> Placement:
+    def settled(self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, **known: Any) -> Placement:
         """All devices where a fit puts them, whose last shifts are theirs.
 
         Args:
-            fitted: the fit. around: its map, with the covariances of the model. at, known: see :class:`Settled`.
+            fitted: the fit. around: its map, with the covariances of the model. others: see :class:`Settled`.
         """
         sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.size for own in self]
         whole = around.shift_covariance() if len(shifts) else shifts[:, None]
         numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
         for own, part in zip(self, numbers.split(sizes), strict=True):
             covariance = whole[part[:, None], part]
-            sets.append(own.settled(Settled(shifts[part], covariance, around, *at, **known)))
+            sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)
 
     def aligned(self, data: T) -> T:
