@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
-from diffeo_calib.calibration.diagnostics.unmeasured_markers import unmeasured_markers
+from diffeo_calib.calibration.diagnostics.plausibility import unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cli.column_names import column

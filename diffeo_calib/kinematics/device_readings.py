@@ -89,7 +89,7 @@ class FittedDevice(NamedTuple):
         columns = (shared != 0).any(1).any(0)
         if fitted.registration is not None or fitted.slopes is None or int(columns.sum()) != len(deviations):
             return placed
-        slopes = placed.observation(len(rows)).by_constants(devices.points_of(_points(fitted.fitted_points[rows])))
+        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3 * devices.seen_points :])
         effects = shared[:, numbers][..., columns]
         root = torch.linalg.lstsq(slopes.flatten(0, 1), effects.flatten(0, 1), driver="gelsd").solution
         return placed._replace(columns=columns, root=root)
@@ -104,7 +104,7 @@ class FittedDevice(NamedTuple):
 
     def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
         """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        points, observation = self.devices.points_of(_points(seen.points)), self.observation(len(seen.points))
+        points, observation = seen.points[:, -3 * self.devices.seen_points :], self.observation(len(seen.points))
         A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - points.shape[1], 0))
         B = self.shared(points)
         if self.columns is None:
@@ -117,11 +117,6 @@ class FittedDevice(NamedTuple):
         if noise:
             covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
         return observation.value(points), covariance
-
-
-def _points(coordinates: Tensor) -> Tensor:
-    """(N, P, 3) points by their coordinates (N, 3 P)."""
-    return coordinates.unflatten(1, (-1, 3))
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:

@@ -152,12 +152,6 @@ class PlacedDevices:
             self.shown or other.shown,
         )
 
-    def with_rows_of(self, other: PlacedDevices) -> PlacedDevices:
-        """The same devices, with the rows that others of their names measured."""
-        number = torch.tensor([self.names.index(name) for name in other.names], dtype=torch.int64, device=HOST)
-        device = torch.cat([self.device, number[other.device]])
-        return replace(self, rows=torch.cat([self.rows, other.rows]), device=device)
-
     def same_set(self, other: PlacedDevices) -> bool:
         """Whether others are of one set with these: of the same kind, and under the same names if readings are."""
         return self.kind == other.kind and (self.devices is None or bool(set(self.names) & set(other.names)))

@@ -10,7 +10,7 @@ from reading_bank import scales
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.labels import OtherLabel, label_text
+from diffeo_calib.calibration.placing.placement import OtherLabel, label_text
 from diffeo_calib.robots import SimulatedArm
 
 ARM, ROWS = SimulatedArm(seed=0), 60

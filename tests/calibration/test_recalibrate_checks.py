@@ -14,7 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
-from diffeo_calib.kinematics.re_registration.usual_noise import larger
+from diffeo_calib.kinematics.re_registration.linear_rows import larger
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 pytestmark = pytest.mark.slow

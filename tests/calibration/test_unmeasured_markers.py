@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.unmeasured_markers import check_markers, unmeasured_markers
+from diffeo_calib.calibration.diagnostics.plausibility import check_markers, unmeasured_markers
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -428,5 +428,5 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     )
     assert done.code == 0, done.error
     header, *rows = cells(tmp_path / "f.csv")
-    added = torch.tensor([float(row[header.index("add_z")]) for row in rows])
+    added = torch.tensor([float(row[header.index("add_z [mm]")]) for row in rows])
     assert float(added.max() - added.min()) > 0.1

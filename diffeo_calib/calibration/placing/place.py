@@ -17,14 +17,13 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
-from diffeo_calib.calibration.diagnostics.labels import OtherLabel, label_text
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherRows, Placement
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, label_text
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,

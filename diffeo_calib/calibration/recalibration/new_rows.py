@@ -24,9 +24,14 @@ from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows, NewDate
+from diffeo_calib.kinematics.re_registration.linear_rows import (
+    LinearRows,
+    NewDate,
+    larger,
+    noise_of_rows,
+    typical_noise,
+)
 from diffeo_calib.kinematics.re_registration.register_again import MARKER_DEVIATIONS
-from diffeo_calib.kinematics.re_registration.usual_noise import larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails, reweight

@@ -2,25 +2,26 @@
 
 1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
 2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
-3 changes     what else has changed: named parts may drift (changes.py), and everything a little (usual_drift.py)
+3 changes     what else has changed: named parts may drift (changes.py), and everything a little
 4 fit         the exact model of old and new rows, with the old scales (both_dates.py)
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.recalibration.changed_parts import parts_of
-from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
-from diffeo_calib.calibration.recalibration.changes import Drift as PartDrift
+from diffeo_calib.calibration.recalibration.changes import ChangedPart, Changes, Drift, find_changes, parts_of
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
@@ -32,7 +33,6 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     warn_of_places,
 )
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
-from diffeo_calib.calibration.recalibration.usual_drift import usual_drift
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
@@ -58,7 +58,6 @@ from diffeo_calib.sensors.set_ups import mounted_of
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
-Drift = Literal["tested", "none"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,7 +119,7 @@ def recalibrate(
     new: Any,
     *,
     marker: Marker = "evidence",
-    drift: Drift = "tested",
+    drift: Literal["tested", "none"] = "tested",
     seed: int = 0,
     progress: Progress = silent,
     note: str = "",
@@ -182,7 +181,7 @@ def recalibrate(
     return _result(model, before, rows, changes, fitted=fitted, note=note)
 
 
-def fit_both(rows: NewRows, drifts: list[PartDrift], progress: Progress) -> Fit:
+def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
     """The exact model of old and new rows with the old scales."""
     old, drifted = rows.fitted, list[Tensor]()
     if drifts:
@@ -244,9 +243,13 @@ def _with_settled(
     at = fitted.model, rows.centre, place.transform
     for one in rows.placement.settled(fitted, *at, known=mounted_of(model)).placed():
         own = replace(one, rows=one.rows + first)
-        for number, other in enumerate(found):
-            if own.same_set(other):
-                found[number] = own.beside(other) if own.set_ups is not None else other.with_rows_of(own)
+        for k, other in enumerate(found):
+            if own.same_set(other) and own.set_ups is not None:
+                found[k] = own.beside(other)
+            elif own.same_set(other):
+                number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
+                device = torch.cat([other.device, number[own.device]])
+                found[k] = replace(other, rows=torch.cat([other.rows, own.rows]), device=device)
     return tuple(found)
 
 
@@ -312,3 +315,58 @@ def warn_of_contradictions(rows: NewRows, excess: float) -> None:
         what = f"{bad} of {len(rows)} new rows contradict the old model"
         fix = "check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh"
         warn_user(sentence(what, expected="rows of the same robot, most of them right", fix=fix))
+
+
+USUAL_LOG, EFOLDS = -6.0, 2.5
+"""Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
+LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
+"""Logarithms of the s^2 that are tried."""
+ROUNDS = 10
+
+
+def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
+    """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
+
+    In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
+    ones by s^2 times their old prior variance; the sizes s^2 maximise the evidence of the new rows with a wide prior
+    below one percent.
+
+    Args:
+        rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
+    """
+    free = {each.part.name for each in named}
+    groups: dict[str, list[ChangedPart]] = {}
+    for part in parts_of(rows):
+        if part.name not in free:
+            groups.setdefault(part.name if part.joint is None else "transmissions", []).append(part)
+    if not groups:
+        return []
+    roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
+    known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
+    doubted, sizes = rows.if_drifting([*known, *roots]), list[float]()
+    for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
+        sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
+        if odds < least:
+            return []
+    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
+
+
+def _likeliest(rows: NewRows, roots: list[Tensor]) -> tuple[list[float], float]:
+    """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
+    sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
+    prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()
+
+    def scaled(k: int) -> Tensor:
+        return sizes[chosen[k]].sqrt() * roots[k]
+
+    every = range(len(roots))
+    for _ in range(ROUNDS):
+        before = list(chosen)
+        for k in every:
+            beside = rows.drifting([scaled(j) for j in every if j != k])
+            chosen[k] = int((beside.evidence(roots[k]).log_odds(sizes) + prior).argmax())
+        if chosen == before:
+            break
+    together = torch.cat([scaled(k) for k in every], 2)
+    odds = rows.evidence(together).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
+    return sizes[chosen].tolist(), float(odds)

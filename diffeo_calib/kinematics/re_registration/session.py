@@ -11,8 +11,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.linear_rows import noise_of_rows
 from diffeo_calib.kinematics.re_registration.registered_map import HARDLY
-from diffeo_calib.kinematics.re_registration.usual_noise import noise_of_rows
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.bodies import Bodies
