@@ -35,8 +35,9 @@ SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
-MOST_WAYS = 24
-"""Ways to read the rows that are tried with a registration."""
+MOST_WAYS = 60
+"""Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
+TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
 SMALLEST_M = 1e-9
 """Mean motion of a flange that turns at one place."""
 RANK = 1e-6
@@ -153,7 +154,12 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     first = f"{why}; by their names, commanded poses in place of joint values"
     texts = dict.fromkeys(one.joints.text for one in alike)
     columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
-    return alike[0], columns, [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+    units = [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+    if len(found) >= MOST_WAYS:
+        columns, units = (
+            [one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)
+        )
+    return alike[0], columns, units
 
 
 def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:

@@ -430,3 +430,18 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     header, *rows = cells(tmp_path / "f.csv")
     added = torch.tensor([float(row[header.index("add_z [mm]")]) for row in rows])
     assert float(added.max() - added.min()) > 0.1
+
+
+def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, command: Command) -> None:
+    """Every convention explains the rows."""
+    commanded = flange()
+    commanded[:, :3, :3] = commanded[0, :3, :3]
+    found = seen(commanded, camera_on_tool=True)
+    turns = rotation_numbers(commanded[:, :3, :3], "rotvec"), rotation_numbers(found[:, :3, :3], "rotvec")
+    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0]}
+    table = write_columns(
+        tmp_path / "t.csv", **poses, tx_ty_tz=1e3 * found[:, :3, 3], **{"rvec_x|rvec_y|rvec_z": turns[1]}
+    )
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    proposed = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
+    assert not {"robot-pose", "convention", "rotation-angle"} & {*proposed}
