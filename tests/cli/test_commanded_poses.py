@@ -144,8 +144,11 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command) -> None:
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * commanded, "x_y_z": 1e3 * measured})
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
-    done = command("fit", tmp_path / "c.toml")
+    done = command("fit", tmp_path / "c.toml", "--report", tmp_path / "r.html")
     assert done.code == 0, done.error
+    report = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Why" in report
+    assert "Gravity" not in report
     alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
     done = command("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
     assert done.code == 0, done.error

@@ -62,9 +62,7 @@ def run(given: FitOptions) -> None:
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
     own = result.placed.coordinates
-    on_tool = None if own is None else own.table.sees_board_from_tool  # of a camera that measured the rows
-    if on_tool is None and is_cartesian(chain) and result.placed.lever is not None:
-        on_tool = False  # a fixed camera sees the frame on the tool
+    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=is_cartesian(chain))
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)

@@ -44,6 +44,7 @@ from diffeo_calib.reports.plots.joints import (
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
 from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
 
@@ -182,13 +183,17 @@ def why(found: Findings) -> Section:
             f"{printable(name)}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
         )
         pictures.append(panel(f"transmission-{joint}", label, draw_transmission, found.model, found.rows, joint))
+    see = "A wide band means that the joint was measured too little there."
+    notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
+    if is_cartesian(found.model.robot):  # joints without links, gears and weight
+        return Section("why", "Why", see, [], None, pictures, notes)
     see = (
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
-        "meshing; a wide band means that the joint was measured too little there."
+        f"meshing. {see}"
     )
     notes = [
-        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
-        "several joints, task space on the place of the marker.",
+        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}.",
+        *notes,
         *(f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)),
         "Corrections are open where the rows do not tell them; those of parallel axes stand for one another.",
     ]
