@@ -208,6 +208,7 @@ def test_calibrations(name: str) -> None:
     made, said = CALIBRATIONS[name]
     given = made()
     found = same(lambda: calibration(*given))
+    assert said or len(found) > 1  # not refused
     assert said in " ".join(text for text in found if isinstance(text, str))
 
 

@@ -28,6 +28,7 @@ from typer.core import TyperGroup
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import InputError, as_written, printable
+from diffeo_calib.common.files import PROGRAM
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -303,6 +304,8 @@ def _text(path: Path, name: str, value: object, hint: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise InputError.of(f"{path}: {name}", expected="text or a number", got=as_written(value))
     begin = CORNERS if str(value).startswith(CORNERS) and str(value).endswith(".yaml") else ""
+    if PROGRAM in str(value):
+        begin = str(value).rpartition("=")[0] + "="
     file = str(value).removeprefix(begin)
     return f"{begin}{path.parent / file}" if begin or has(hint, Path) else file
 

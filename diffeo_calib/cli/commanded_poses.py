@@ -18,6 +18,7 @@ from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import ROTATIONS, Sheet
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import numbers_in
@@ -35,6 +36,8 @@ SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
+JOINTS = "q0", "q1"
+"""First names of four numbers before a place that are joint values rather than a quaternion."""
 MOST_WAYS = 60
 """Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
@@ -74,15 +77,16 @@ def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
     places = sorted((list(group.names.values()) for group in triples), key=lambda own: at[own[0]])
     ends = [0, *(at[own[0]] for own in places), len(sheet.header)]
 
-    def turn(own: Sequence[str], start: int, end: int) -> list[str]:
-        between = [name for name in sheet.header[start:end] if name in sheet.numbers and name not in own]
+    located = {name for own in places for name in own}
+
+    def turn(start: int, end: int) -> list[str]:
+        between = [name for name in sheet.header[start:end] if name in sheet.numbers and name not in located]
         turns = [group for labels, _ in ROTATIONS for group in whole(between, labels)]
         turns = [list(group.names.values()) for group in turns if not group.says("rate", "deviation")]
         return turns[0] if turns else []
 
-    behind = [turn(own, *own_ends) for own, own_ends in zip(places, pairwise(ends[1:]), strict=True)]
-    before = [turn(own, *own_ends) for own, own_ends in zip(places, pairwise(ends[:-1]), strict=True)]
-    first = bool(places) and bool(before[0]) and not behind[-1]
+    behind, before = ([turn(*own) for own in pairwise(part)] for part in (ends[1:], ends[:-1]))
+    first = bool(places) and bool(before[0]) and not behind[-1] and before[0][0] not in JOINTS
     found = [Body(own, turns) for own, turns in zip(places, before if first else behind, strict=True)]
     used = {name for own in found for name in (*own.place, *own.turn)}
     while matrix := matrix_in(csv, sheet, [name for name in sheet.numbers if name not in used]):
@@ -102,10 +106,11 @@ def machine_of(bodies: Sequence[Body]) -> Body:
 
     What is only said to be measured is the machine's where something else was seen as well.
     """
-    others = any(own.words & WORDS["seen"] for own in bodies)
+    seen = WORDS["seen"] - {"target"}
+    others = any(own.words & seen for own in bodies)
 
     def rank(own: Body) -> int:
-        if others and own.words & WORDS["measured"] and not own.words & WORDS["seen"]:
+        if others and own.words & WORDS["measured"] and not own.words & seen:
             return 3
         if own.words & WORDS["machine"]:
             return 2 + bool(own.words & WORDS["measured"])
@@ -209,7 +214,9 @@ def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor:
     """Columns as they are (N, c), of the rows without an empty cell among them."""
     header, lines = read_cells(csv, sheet.sep, names)
     columns = [numbers_in([cells[header.index(name)] for _, cells in lines], sheet.decimal) for name in names]
-    found = torch.tensor([[nan if value is None else value for value in own] for own in columns], dtype=torch.float64)
+    found = torch.tensor(
+        [[nan if value is None else value for value in own] for own in columns], dtype=torch.float64, device=HOST
+    )
     return found[:, found.isfinite().all(0)].T
 
 

@@ -57,7 +57,6 @@ ROTATIONS = (
     (("a", "b", "c"), "angles of KUKA: ZYX in deg"),
     (("w", "p", "r"), "angles of Fanuc: xyz in deg"),
     (("o", "a", "t"), "angles of Kawasaki: ZYZ in deg"),
-    (("u", "v", "w"), "angles of Epson about z, y and x in deg"),
     (("euler1", "euler2", "euler3"), "Euler angles"),
     (("alpha", "beta", "gamma"), "Euler angles"),
     (("phi", "theta", "psi"), "Euler angles"),

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
-from diffeo_calib.common.files import IMAGE_SUFFIXES, check_writable, write_whole
+from diffeo_calib.common.files import IMAGE_SUFFIXES, PROGRAM, check_writable, write_whole
 
 if TYPE_CHECKING:
     from diffeo_calib.sensors.errors import Evaluation
@@ -206,7 +206,7 @@ def check_outputs(
         if name not in may_come and not os.path.lexists(path):
             kind = "model file" if name in ("MODEL", "OLD") else "file"
             fix = f"check the path of {name}"
-            if ".py:" in path.name:
+            if PROGRAM in path.name:
                 fix = f"name a function with the columns that it reads: --robot-pose A,B,...={path}"
             raise InputError.of(f"there is no {kind} {path}", fix=fix)
 

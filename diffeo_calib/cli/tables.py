@@ -24,10 +24,11 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
-from diffeo_calib.measurements.csv.joints import PROGRAM, PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
@@ -134,8 +135,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    program = completed[1].robot_pose
-    if units.robot_pose is None and program is not None and PROGRAM in program:
+    program = "" if units.robot_pose else _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0]
+    if PROGRAM in program:
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
     if words:

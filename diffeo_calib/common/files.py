@@ -248,6 +248,8 @@ def _take_permissions(part: Path, target: Path) -> None:
     part.chmod(known.st_mode & 0o777)
 
 
+PROGRAM = ".py:"
+"""In FILE.py:NAME, a function in a file."""
 IMAGE_SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of the files that figures can be written to."""
 

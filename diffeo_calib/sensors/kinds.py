@@ -31,7 +31,8 @@ def register(kind: type[Devices]) -> type[Devices]:
         InputError: no such subclass, or the name of another kind.
     """
     whole = isinstance(kind, type) and issubclass(kind, Devices) and not kind.__abstractmethods__
-    if not whole or (kind.prior.__func__ is Devices.prior.__func__ and not hasattr(kind, "increments_each")):
+    usual = whole and getattr(kind.prior, "__func__", None) is Devices.prior.__func__
+    if not whole or (usual and not hasattr(kind, "increments_each")):
         expected = "a subclass of Devices with all of its methods"
         raise InputError.of("a kind of device", expected=expected, got=repr(kind))
     if KINDS.get(kind.kind, kind).__qualname__ != kind.__qualname__:

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from again_bank import arm, model, positions
+from again_bank import arm, model, payloads, positions
 from campaigns import CAMPAIGNS
 from product_bank import usual_scales
 from torch import Tensor
@@ -166,3 +166,12 @@ def test_ratios_are_those_of_the_definition() -> None:
         best = densities(root, SIZES).amax(0)
         assert found[name].value == pytest.approx(2.0 * float(best.max() - without.max()), rel=1e-6)
         assert found[name].variance == pytest.approx(float(SIZES[best.argmax()]))
+
+
+def test_a_model_with_payloads_is_compared_with_one_without_any_under_none() -> None:
+    loaded, bare = model(payloads), model(positions)
+    for pair in ((loaded, bare), (bare, loaded)):
+        found = dc.compare(*pair)
+        assert found.payload == 0.0
+        assert found.rms < 3.0 * found.expected
+        assert str(found).startswith("with a payload of 0")

@@ -110,7 +110,7 @@ def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult)
     """Free base and first joint add rigid motions to the prior, and these alone."""
     fitted = result.model.map
     variance = fitted.geodesic.spec.prior_variance.clone()
-    variance[list(held_parameters(result.model.nominal.geometry))] = 1e-6
+    variance[list(held_parameters(result.model.nominal.geometry, adrift=True))] = 1e-6
     free = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise, fitted.workspace)
     held, other = (one.posterior(fitted.x[:5], noise=False)[1] for one in (fitted, free))
     torch.testing.assert_close(held, other, rtol=2e-2, atol=1e-11)
@@ -180,7 +180,7 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
         away = shift * torch.tensor([1.0, -1.0, 0.5]).double()
         places = SocketDevices.around(with_attributes(data, sockets=bare), found.positions + away)
         placed, shared = places.at_places(data), places.shared(3).unflatten(1, (-1, 3))
-        held = held_parameters(geometry)
+        held = held_parameters(geometry, adrift=True)
         given = 1e-4, Prior()
         thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)
     assert not bool(thetas[0][:12].any())

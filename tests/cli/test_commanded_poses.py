@@ -72,6 +72,7 @@ def test_init_finds_what_the_numbers_mean(
 @pytest.mark.parametrize(
     ("names", "machine"),
     [
+        ("target_x target_y target_z measured_x measured_y measured_z", "target_x"),
         ("cmd_x cmd_y cmd_z actual_x actual_y actual_z board_x board_y board_z", "actual_x"),
         ("x_soll y_soll z_soll x_ist y_ist z_ist cam_x cam_y cam_z", "x_ist"),
         ("a_x a_y a_z b_x b_y b_z", "a_x"),
@@ -345,6 +346,7 @@ def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.Monke
         ("def f(q): return q @ q", "f", "own.py:f of 5 rows: got RuntimeError"),
         ("def f(q): return q[:, :1].expand(-1, 4)", "f", r"returns: expected places \(5, k\).* got \(5, 4\)"),
         ("def f(q): return q[:4]", "f", r"returns: expected places \(5, k\).* got \(4, 2\)"),
+        ("def f(q): return 1.0", "f", r"returns: expected places \(5, k\).* got \(\)"),
         ("def f(q): return q[0]", "f", r"returns: expected places \(5, k\).* got \(2,\)"),
         ("def f(q): return (q - q[2:3]).log()", "f", "of row .*2.*: expected finite numbers"),
     ],
@@ -448,3 +450,29 @@ def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, command: 
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     proposed = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
     assert not {"robot-pose", "convention", "rotation-angle"} & {*proposed}
+
+
+def test_a_campaign_file_names_a_function_beside_it(delta: Path, tmp_path: Path, command: Command) -> None:
+    entries = {"csv": "delta.csv", "robot-pose": "q1,q2,q3=my_delta.py:kinematics", "position": "x,y,z"}
+    lines = [f'{name} = "{value}"' for name, value in {**entries, "length": "mm", "angle": "deg"}.items()]
+    (delta / "c.toml").write_text("\n".join(lines), encoding="utf-8")
+    done = command("fit", delta / "c.toml", "-o", tmp_path / "m.safetensors")
+    assert done.code == 0, done.error
+    done = command("evaluate", tmp_path / "m.safetensors", delta / "delta.csv", *MEASURED)
+    assert "type it again" in done.error
+
+
+def test_models_of_poses_are_compared_at_the_same_poses() -> None:
+    """Their inputs are relative to the middle of the poses of each fit."""
+    models = []
+    for seed in (0, 1):
+        commanded = flange(seed)
+        measured = seen(commanded, camera_on_tool=True, seed=seed + 5)
+        if seed:
+            commanded, measured = commanded[:18], measured[:18]
+        machine = cartesian(commanded)
+        data = dc.Measurements.from_poses(dc.pose_inputs(machine, commanded), measured, camera_on_tool=True)
+        models.append(dc.calibrate(machine, data).model)
+    found = dc.compare(*models)
+    assert not found.changes.found
+    assert found.rms < 1e-3

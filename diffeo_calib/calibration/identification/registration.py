@@ -86,8 +86,9 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
         raise MeasurementError.of(what, expected="every marker in some rows", fix=fix)
     found = place(bare.marker_poses(q), points)
     base, tool = found.base, found.tool
-    if turns_nowhere(chain):  # where the first marker sits belongs to the base
-        base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype), tool[0]), tool - tool[0]
+    if turns_nowhere(chain):  # where the marker sits, or the middle of several, belongs to the base
+        middle = tool.mean(0)
+        base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype, device=tool.device), middle), tool - middle
     return _registered(replace(bare, base=base, tool=tool), q, points, found.iterations)
 
 

@@ -68,5 +68,6 @@ def _devices(model: CalibratedKinematics) -> Iterator[DeviceReadings]:
             fitted = FittedDevice.of(model.map, one, number)
             devices, offset = fitted.devices, float(fitted.devices.deviations[-1])
             prior = devices.constants.new_tensor(devices.prior(offset))
-            named = replace(devices, names=(f"{one.kind} {word}" if several else word,), deviations=prior)
+            known = devices.deviations if fitted.columns is None else prior
+            named = replace(devices, names=(f"{one.kind} {word}" if several else word,), deviations=known)
             yield DeviceReadings(None, named, fitted)

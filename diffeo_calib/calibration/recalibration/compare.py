@@ -32,7 +32,9 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.register_again import find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.errors import Evaluations
 
 MOST_PREDICTED = 60
@@ -154,23 +156,37 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     if model.robot.joint_names != other.robot.joint_names:
         expected, got = ", ".join(model.robot.joint_names), ", ".join(other.robot.joint_names)
         raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
-    fits = other.configurations, model.configurations
+    markers = model.nominal.geometry.markers
+    if model.registration is not None and model.markers != markers:
+        got = f"a model registered with {model.markers} marker(s), fitted with {markers}"
+        fix = "pass the model as it was before its registration: places are found anew"
+        raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
+    fits = _inputs(model.robot, other.robot, other.configurations), model.configurations
     low = torch.maximum(*(own.amin(0) for own in fits))
     high = torch.minimum(*(own.amax(0) for own in fits))
     q = torch.cat(fits)
     q = q[((q >= low) & (q <= high)).all(1)]
     if len(q) < FEWEST_ROWS:
-        fix = "compare a model with measurements"
-        raise InputError.of("the models hardly have configurations in common", fix=fix)
+        name = model.robot.joint_names[int((low - high).argmax())]
+        what = f"the models hardly have configurations in common, above all of {name}"
+        raise InputError.of(what, fix="compare a model with measurements")
     q = q[:: -(-len(q) // MOST_PREDICTED)]
+    there = _inputs(other.robot, model.robot, q)
 
-    def measured(points: Tensor) -> Measurements:
-        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(model.nominal.load)
+    def measured(own: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
+        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.nominal, other.lever, measured(model(q))).registration
+    found = find_place(fitted, other.nominal, other.lever, measured(other, there, model(q))).registration
     placed = RegisteredMap(moved(fitted, found.transform), found)
-    rows = weighed(place_again(model, measured(placed(q).unflatten(1, (-1, 3))), "other"), "other")
-    values, vectors = torch.linalg.eigh(FittedMap.joint_covariance(placed, q))
+    new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
+    rows = weighed(place_again(model, new, "other"), "other")
+    values, vectors = torch.linalg.eigh(FittedMap.joint_covariance(placed, there))
     errors = vectors * values.clamp(min=0.0).sqrt()
     return rows.if_drifting([errors.unflatten(0, (len(q), -1))])
+
+
+def _inputs(robot: Tree, other: Tree, q: Tensor) -> Tensor:
+    """Joint values (N, n) that mean the same for a robot as these for another: of commanded poses to each its own."""
+    alike = turns_nowhere(robot) or not is_cartesian(robot)
+    return q if alike else pose_inputs(robot, other(q))

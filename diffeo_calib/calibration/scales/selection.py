@@ -117,7 +117,7 @@ def select(
         centre: centre of the prior: the defaults.
         data: the measurements.
         start: where the search starts; by default it makes shorter searches from the defaults with each of several
-            transmission length scales, and for a machine with commanded places from short waves and little noise.
+            transmission length scales, and of commanded poses or places from short waves and little noise.
         seed: draws the subset of poses.
         limits: size of the search.
         progress: called as ``progress(task, done, total)``.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, isnan, radians
 
 import torch
@@ -85,7 +85,8 @@ def run(options: CorrectOptions) -> None:
     table = source.written()
     if len(options.tip or ()) == 1:
         kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
-    robot, tools = kinematics.robot, _tools(kinematics, options, table)
+    turned = {"convention": options.targets.convention, "rotation_angle": options.targets.rotation_angle}
+    robot, tools = kinematics.robot, _tools(kinematics, options, replace(source.table, **turned))
     names = joint_columns(source.joints, robot)
     columns = Columns.of(table.joints_only(names, robot.kinds))
     sheet = Program.read(program, table, columns.names)

@@ -36,7 +36,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
-from diffeo_calib.robots.cartesian import is_cartesian
+from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
 
@@ -62,7 +62,11 @@ def run(given: FitOptions) -> None:
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
     own = result.placed.coordinates
-    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=is_cartesian(chain))
+    on_tool = (
+        None
+        if own is None
+        else own.table.sees_board_from_tool(commanded=is_cartesian(chain) and not turns_nowhere(chain))
+    )
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)

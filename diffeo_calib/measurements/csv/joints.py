@@ -23,6 +23,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_written, few, listed
+from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.poses import (
@@ -37,8 +38,6 @@ from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain
 
-PROGRAM = ".py:"
-"""In the place of a convention: FILE.py:NAME, a function of the columns."""
 FACTOR = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?|pi|\{[^{}]+\})"
 TERM = rf"{FACTOR}(?:\s*[*/]\s*{FACTOR})*"
 EXPRESSION = re.compile(rf"\s*[+-]?\s*{TERM}(?:\s*[+-]\s*{TERM})*\s*")
@@ -244,11 +243,11 @@ def _made(program: str, cells: Tensor) -> Tensor:
     if function is None:
         raise MeasurementError.of(f"the file '{path}'", expected=f"a function {name}", got="none of this name")
     try:
-        found = torch.as_tensor(function(cells), dtype=cells.dtype)
+        found = torch.as_tensor(function(cells), dtype=cells.dtype, device=cells.device)
     except Exception as error:
         raise MeasurementError.of(f"{program} of {len(cells)} rows", got=f"{type(error).__name__}: {error}") from error
     places = found.ndim == 2 and 1 <= found.shape[1] <= 3
-    if len(found) != len(cells) or not (places or found.shape[1:] == (4, 4)):
+    if found.ndim == 0 or len(found) != len(cells) or not (places or found.shape[1:] == (4, 4)):
         expected = f"places ({len(cells)}, k) with k = 1, 2 or 3, or poses ({len(cells)}, 4, 4)"
         raise MeasurementError.of(f"what {program} returns", expected=expected, got=str(tuple(found.shape)))
     lost = (~found.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
@@ -256,7 +255,7 @@ def _made(program: str, cells: Tensor) -> Tensor:
         fix = "leave these rows out, or check the unit of their columns"
         what = f"what {program} returns of row {few(lost)}"
         raise MeasurementError.of(what, expected="finite numbers", got="NaN or infinity", fix=fix)
-    return found.to(cells.device)
+    return found
 
 
 @cache
