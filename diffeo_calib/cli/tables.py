@@ -135,7 +135,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    program = "" if units.robot_pose else _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0]
+    named = PROGRAM in command and not units.robot_pose
+    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if named else ""
     if PROGRAM in program:
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
