@@ -188,6 +188,8 @@ def _read(
     turn, place = ([], []) if body is None else (body.turn, body.place)
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(csv, sheet, [name for names in groups for name in names])
+    if not len(numbers):
+        return
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
     length = _lengths(machine.place, commanded_at)[0]
     other = _lengths(place, seen_at)[0] if place else length

@@ -23,7 +23,7 @@ from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv import joints
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import transforms
@@ -476,3 +476,29 @@ def test_models_of_poses_are_compared_at_the_same_poses() -> None:
     found = dc.compare(*models)
     assert not found.changes.found
     assert found.rms < 1e-3
+
+
+def test_no_row_shows_the_board(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    header, *rows = cells(table)
+    lines = [header, *([*row[:-1], ""] for row in rows[::2]), *(["", *row[1:]] for row in rows[1::2])]
+    table.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
+    done = command("init", table, "-o", tmp_path / "c.toml")
+    assert done.code == 1
+    assert "no way to read them" in done.error
+
+
+def test_a_tool_is_a_rotation_vector_whatever_the_poses_are(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    assert command("fit", tmp_path / "c.toml").code == 0
+    written = []
+    for convention in ("xyz", "rotvec"):  # by default that of the poses
+        options = ["--convention", convention, "--rotation-angle", "deg"] if convention == "rotvec" else []
+        tool = ["--tool", "0,0,100,20,30,40", *options]
+        assert command("correct", tmp_path / "t.safetensors", table, *tool, "-o", tmp_path / "c.csv").code == 0
+        header, *rows = cells(tmp_path / "c.csv")
+        at = header.index("command_z") + 1
+        turns = [[float(cell) for cell in row[at : at + 3]] for row in rows]
+        written.append(rotation_matrices(turns, convention, angle="deg"))
+    assert_close(*written, rtol=0, atol=1e-6)
