@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import transforms
 
 ROWS = 24
@@ -57,3 +58,13 @@ def bent(places: Tensor) -> Tensor:
     """A gantry out of square by 1 mrad, whose rail is bent, m."""
     x, y, z = places.unbind(1)
     return torch.stack([x + 1e-3 * y, y + 3e-4 * torch.sin(5.0 * x), z], 1)
+
+
+def cells(path: Path) -> list[list[str]]:
+    return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def without_frames(there: Tensor, wanted: Tensor) -> float:
+    """RMS distance, m, wherever the measuring frame is."""
+    T = rigid_fit(there, wanted)
+    return float((there @ T[:3, :3].mT + T[:3, 3] - wanted).square().sum(1).mean().sqrt())

@@ -1,0 +1,105 @@
+"""Functions of one's own in place of a robot: `--robot-pose A,B,...=FILE.py:NAME`."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import Command
+from commanded_bank import cells, drawn, flange, without_frames, write_columns
+from documentation_bank import write_commanded_tables
+from torch.testing import assert_close
+
+from diffeo_calib.measurements.csv import joints
+from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.robots.cartesian import cartesian
+
+if sys.version_info >= (3, 11):
+    pass
+else:
+    pass  # pyright: ignore[reportMissingImports]
+
+
+@pytest.fixture(scope="module")
+def delta(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a delta robot, its table and its program."""
+    place = tmp_path_factory.mktemp("delta")
+    write_commanded_tables(place)
+    return place
+
+
+MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
+
+
+def test_a_function_in_place_of_a_robot(
+    delta: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(delta)
+    pose, model = ["--robot-pose", "q1,q2,q3=my_delta.py:kinematics"], tmp_path / "m.safetensors"
+    done = command("fit", "delta.csv", *pose, *MEASURED, "--json", tmp_path / "f.json", "-o", model)
+    assert done.code == 0, done.error
+    done = command("evaluate", model, "delta.csv")
+    assert done.code == 1
+    assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=my_delta.py:kinematics" in done.error
+    done = command("predict", model, "delta.csv", *pose, "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.error
+    (header, *rows), (_, *measured) = cells(tmp_path / "p.csv"), cells(delta / "delta.csv")
+    assert header[:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
+    found = torch.tensor([[float(cell) for cell in row[:6]] for row in rows], dtype=torch.float64)
+    q, there = torch.tensor([[float(cell) for cell in row] for row in measured], dtype=torch.float64).split(3, 1)
+    nominal = runpy.run_path("my_delta.py")["kinematics"](q)
+    assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
+    assert float((found[:, 3:] - there).norm(dim=1).mean()) < 0.2 * without_frames(nominal, there)
+    assert command("plan", model, "-n", "3", *pose, "-o", tmp_path / "n.csv").code == 0
+    assert cells(tmp_path / "n.csv")[0] == ["x", "y", "z", "rank"]
+    done = command("correct", model, "targets.csv", *pose, "-o", tmp_path / "c.csv")
+    assert done.code == 0, done.error
+    header, *rows = cells(tmp_path / "c.csv")
+    assert {row[header.index("status")] for row in rows} == {"reached"}
+    corrected = [[float(row[header.index(axis)]) for axis in "xyz"] for row in rows]
+    assert "q1" not in header  # of the program before
+    again = write_columns(tmp_path / "again.csv", x_y_z=torch.tensor(corrected, dtype=torch.float64))
+    places = ["--robot-pose", "x,y,z", "--length", "mm", "--angle", "deg"]
+    assert command("predict", model, again, *places, "-o", tmp_path / "a.csv").code == 0
+    reached = [[float(cell) for cell in row[3:6]] for row in cells(tmp_path / "a.csv")[1:]]
+    wanted = nominal[:5] - nominal[:5].mean(0)
+    away = torch.tensor(reached, dtype=torch.float64)
+    assert without_frames(wanted, away) < 0.05  # of the frame of the device
+
+
+def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    joints._module.cache_clear()
+    commanded = flange()
+    torch.save(commanded, tmp_path / "frames.pt")
+    text = "import torch\n\ndef kinematics(cells):\n    return torch.load('frames.pt')\n"
+    (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    own = PoseColumns.of("a,b=own.py:kinematics")
+    machine = cartesian(own.poses(drawn(len(commanded), 2, seed=0)))
+    told = replace(own, robot=machine)
+    assert_close(machine(told.values(drawn(len(commanded), 2, seed=0))), commanded, rtol=0, atol=1e-12)
+    assert told.written.columns == ("x", "y", "z", "rx", "ry", "rz")
+    assert_close(
+        told.written.poses(told.written.cells(told.values(drawn(24, 2, seed=0)))), commanded, rtol=0, atol=1e-9
+    )
+
+
+def test_a_function_is_named_with_its_columns(tmp_path: Path, command: Command) -> None:
+    table = write_columns(tmp_path / "t.csv", q1_q2_q3=drawn(9, 3, seed=1), x_y_z=drawn(9, 3, seed=2))
+    done = command("fit", table, "--robot", "own.py:f", *MEASURED, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert "--robot-pose A,B,...=own.py:f" in done.error
+
+
+def test_a_campaign_file_names_a_function_beside_it(delta: Path, tmp_path: Path, command: Command) -> None:
+    entries = {"csv": "delta.csv", "robot-pose": "q1,q2,q3=my_delta.py:kinematics", "position": "x,y,z"}
+    lines = [f'{name} = "{value}"' for name, value in {**entries, "length": "mm", "angle": "deg"}.items()]
+    (delta / "c.toml").write_text("\n".join(lines), encoding="utf-8")
+    done = command("fit", delta / "c.toml", "-o", tmp_path / "m.safetensors")
+    assert done.code == 0, done.error
+    done = command("evaluate", tmp_path / "m.safetensors", delta / "delta.csv", *MEASURED)
+    assert "type it again" in done.error
