@@ -24,7 +24,7 @@ from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
-from diffeo_calib.runtime.build import perpendicular
+from diffeo_calib.runtime.chain import perpendicular
 
 URDF_FILE = Path(__file__).with_name("simulated_upper_body.urdf")
 GRAVITY = (0.0, 0.0, -9.81)

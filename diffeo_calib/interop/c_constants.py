@@ -83,14 +83,16 @@ def sag_constants(chain: CalibratedChain, sag: Sag) -> dict[str, Any]:
     (K,) whether the coordinate shifts its joint, or turns it, along or about ``directions`` (K, 3).
     """
     count = len(sag.joints)
-    W = sag.moments.reshape(count, 3, len(sag.offsets), 3)
-    own = sag.directions.reshape(count, len(chain.axes), 2, 3)[np.arange(count), sag.joints]  # shift, rotation vector
+    W = sag.moments.reshape(count, 3, len(chain.nominal.offsets), 3)
+    own = sag.directions.reshape(count, len(chain.nominal.axes), 2, 3)[
+        np.arange(count), sag.joints
+    ]  # shift, rotation vector
     shifts = np.any(own[:, 0], axis=1)
     return {
         "sag": sag,
         "count": count,
         "masses": -np.stack([W[:, 2, :, 1], W[:, 0, :, 2], W[:, 1, :, 0]], axis=-1),
-        "moved": (sag.moved != 0) * 1,
+        "moved": chain.nominal.moved * 1,
         "shifts": shifts,
         "directions": np.where(shifts[:, None], own[:, 0], own[:, 1]),
     }

@@ -153,7 +153,7 @@ def c_source(
         limits: (n, 2) of the active joints [rad or m].
         texts: ``robot``, its name; ``joints``, a line for each; ``frame_name`` of the results; ``remarks``, sentences.
     """
-    chain, joints = program.chain, len(program.chain.axes)
+    chain, nominal, joints = program.chain, program.chain.nominal, len(program.chain.nominal.axes)
     named = (
         ("joint", "phi^-1: corrections of the joints", program.joint_flow),
         ("task", "psi: corrections of positions", program.task_flow),
@@ -169,8 +169,8 @@ def c_source(
         "generated": f"{GENERATED} {package_version()}",
         "lanes": LANES,
         "tree": not chain.serial,
-        "parents": chain.before[: joints + len(chain.tips)],
-        "on_path": chain.ancestors[joints:][: len(chain.tips)] * 1,
+        "parents": nominal.before[: joints + len(chain.tips)],
+        "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
         "groups": [(tip, *run) for tip, run in _runs(program.on)],
         "program_tip": program.tip,
         "flows": flows,
@@ -179,10 +179,11 @@ def c_source(
         "widths": sorted({term["width"] for term in terms}),
         "tabulated": any(flow["tables"] for flow in flows),
         "chain": chain,
+        "nominal": nominal,
         "waves": chain.waves,
         "moving": joints,
-        "slides": not chain.revolute.all(),
-        "coupled": not np.array_equal(chain.coupling, np.eye(joints)) or bool(chain.coupling_offset.any()),
+        "slides": not nominal.revolute.all(),
+        "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
         "sag": None if chain.sag is None else sag_constants(chain, chain.sag),
         "markers_in_flange": program.markers,
         "tool_points": tool_points(tool, TOOL_LEVER),

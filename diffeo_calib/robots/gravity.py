@@ -38,8 +38,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
-from diffeo_calib.runtime.build import Compliance
-from diffeo_calib.runtime.chain import load_slopes, loads
+from diffeo_calib.runtime.chain import Compliance, load_slopes, loads
 
 
 class GravitySag:
@@ -112,7 +111,13 @@ class GravitySag:
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
         """Derivatives of the twists by the joints: (N, n_all, 6, n)."""
         sag, chain = self._sag(w), self.chain
-        by_moving = load_slopes(chain.axes.to(q.device), chain.revolute.to(q.device), sag, self._frames(q))
+        constants = (
+            chain.axes,
+            chain.revolute,
+            torch.from_numpy(chain.arrays.moved),
+            torch.from_numpy(chain.arrays.signs),
+        )
+        by_moving = load_slopes(_Robot(*(each.to(q.device) for each in constants)), sag, self._frames(q))
         slopes = chain.by_active(self._amounts(q)[..., None] * by_moving)  # (N, compliances, n)
         return (sag.directions.mT @ slopes).unflatten(1, (-1, 6))
 
@@ -188,13 +193,10 @@ class GravitySag:
         for k, compliance in enumerate(own):
             directions[k, compliance.joint] = torch.from_numpy(compliance.direction)
         axes = torch.tensor([c.axis.tolist() for c in own], dtype=torch.float64, device="cpu").view(-1, 3)
-        moved, signs = map(torch.from_numpy, self.chain.arrays.seen_from_ground)
         return {
             "joints": _column([c.joint for c in own], torch.int64),
             "axes": axes,
             "directions": directions.flatten(1),
-            "moved": moved,
-            "signs": signs,
         }
 
 
@@ -206,6 +208,13 @@ class _Sag(NamedTuple):
     joints: Tensor
     axes: Tensor
     directions: Tensor
+
+
+class _Robot(NamedTuple):
+    """That of :class:`diffeo_calib.runtime.chain.NominalChain`."""
+
+    axes: Tensor
+    revolute: Tensor
     moved: Tensor
     signs: Tensor
 
@@ -220,7 +229,7 @@ def _under_payload(chain: Tree, link: str) -> list[Compliance]:
         fix = "name a tip, or the end of a branch that was given as `load`"
         raise InputError.of("the link of the payload", expected=" or ".join(chain.ends), got=link, fix=fix)
     place = chain.moving + list(chain.ends).index(link)
-    seen, moved = _representative(chain, place), chain.arrays.seen_from_ground[0][place]
+    seen, moved = _representative(chain, place), chain.arrays.moved[place]
     found = [one for one in chain.arrays.compliances if moved[one.joint] and (not one.places or seen in one.places)]
     return [replace(one, places=(place,) if one.places else (), loaded=True) for one in found]
 

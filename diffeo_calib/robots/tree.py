@@ -119,7 +119,7 @@ class Tree:
         self.arrays = found = nominal_chain(self.to_config())
         tensors = found.axes, found.revolute, found.coupling, found.coupling_offset
         self.axes, self.revolute, self.coupling, self.coupling_offset = map(torch.from_numpy, tensors)
-        self.motion_terms, self.ancestors = torch.from_numpy(found.motion_terms), torch.from_numpy(found.ancestors)
+        self.motion_terms, self.ancestors = torch.from_numpy(found.motions), torch.from_numpy(found.ancestors)
         self.place_offsets, self.before = torch.from_numpy(found.offsets), tuple(found.before.tolist())
         self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
         self.ground_place = None if self.ground == BASE else len(self.before) - 1

@@ -9,134 +9,20 @@ Sums are plain matrices here: they run once per model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
-from diffeo_calib.runtime.chain import CalibratedChain, Sag
+from diffeo_calib.runtime.chain import CalibratedChain, NominalChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
-COINCIDENT_FRAMES_M = 1e-6
-"""Frames whose origins are closer than this [m] count as one place for masses."""
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
-
-
-@dataclass(frozen=True, eq=False)
-class Compliance:
-    """One compliance and its family of features: the sag of a joint's frame in one direction; see robots/gravity.py.
-
-    Args:
-        joint: number of the moving joint whose frame sags.
-        direction: (6,) unit twist in the frame before the joint's motion, translation first.
-        own: whether it is along the joint's own motion (else lateral).
-        places: numbers of the places at which masses pull. Empty for a slide along its axis, where the feature is the
-            force itself.
-        loaded: whether the load is the payload, whose mass is known.
-    """
-
-    joint: int
-    direction: Array
-    own: bool
-    places: tuple[int, ...]
-    loaded: bool = False
-
-    @property
-    def size(self) -> int:
-        """Number of its features."""
-        return 3 * max(len(self.places), 1)
-
-    @property
-    def axis(self) -> Array:
-        """(3,) the unit vector along which it slides, or about which it turns."""
-        return self.direction[3:] if self.places else self.direction[:3]
-
-
-@dataclass(frozen=True, eq=False)
-class NominalChain:
-    """Constants of a robot, see robots/tree.py.
-
-    Args:
-        offsets: (F, 4, 4) of all places: joints, tips, loads, ground.
-        before: (F,) the moving joints before them, -1 for the base.
-        tips: their names. grounded: whether the last place is the ground; else it is the base.
-        axes: (n_all, 3). revolute: (n_all,).
-        coupling: (n_all, n). coupling_offset: (n_all,).
-    """
-
-    offsets: Array
-    before: np.ndarray
-    tips: tuple[str, ...]
-    grounded: bool
-    axes: Array
-    revolute: np.ndarray
-    coupling: Array
-    coupling_offset: Array
-
-    @cached_property
-    def ancestors(self) -> np.ndarray:
-        """(F, n_all) whether joint l moves place f."""
-        found = np.zeros((len(self.before), len(self.axes)), dtype=bool)
-        for place, last in enumerate(self.before):
-            if last >= 0:
-                found[place] = found[last]
-                found[place, last] = True
-        return found
-
-    @cached_property
-    def motion_terms(self) -> Array:
-        """(4, n_all, 4, 4) C, S, D, L of J_l = C + S sin q + D cos q + L q.
-
-        Rodrigues: 1 + K^2 + K sin q - K^2 cos q.
-        """
-        K = skew(self.axes) * self.revolute[:, None, None]
-        out = np.zeros((4, len(self.axes), 4, 4))
-        out[0] = np.eye(4)
-        out[0, :, :3, :3] += K @ K
-        out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
-        out[3, :, :3, 3] = self.axes * ~self.revolute[:, None]
-        return out
-
-    @cached_property
-    def seen_from_ground(self) -> tuple[np.ndarray, Array]:
-        """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
-
-        A joint between base and ground moves what is on the base's side, in the opposite sense.
-        """
-        moved, signs = self.ancestors.copy(), np.ones(len(self.axes))
-        if self.grounded:
-            between = self.ancestors[-1]
-            moved[:, between] = ~moved[:, between]
-            signs[between] = -1.0
-        return moved, signs
-
-    @cached_property
-    def distinct(self) -> np.ndarray:
-        """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
-        far = np.linalg.norm(self.offsets[:, :3, 3], axis=1) > COINCIDENT_FRAMES_M
-        ends = (self.before < 0) & (np.arange(len(self.before)) >= len(self.axes))
-        return far | np.where(self.before < 0, ends, ~self.revolute[self.before])
-
-    @cached_property
-    def compliances(self) -> tuple[Compliance, ...]:
-        """Every joint's own compliance and its two lateral ones (three for a slide)."""
-        moved, found = self.seen_from_ground[0] & self.distinct[:, None], []
-        for joint, axis in enumerate(self.axes):
-            beyond = tuple(place for place in np.flatnonzero(moved[:, joint]).tolist() if place != joint)
-            if not self.revolute[joint]:
-                found.append(Compliance(joint, np.append(axis, np.zeros(3)), True, ()))
-            if beyond:
-                turns = np.pad([axis, *perpendicular(axis)], ((0, 0), (3, 0)))
-                own = bool(self.revolute[joint]), False, False
-                found += [Compliance(joint, *turn, beyond) for turn in zip(turns, own, strict=True)]
-        return tuple(found)
 
 
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
@@ -175,12 +61,15 @@ def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
         raise RobotError.of(f"robot '{robot['name']}' has several joints named {twice}", fix="give each its own name")
     axes = np.array([joint["axis"] for joint in moving], float)
     revolute = np.array([joint["kind"] in ROTARY for joint in moving])
-    fixed = [joint["name"] for joint in (*joints, *drivers) if joint["kind"] == "fixed"]
+    K, motions = skew(axes) * revolute[:, None, None], np.zeros((4, len(axes), 4, 4))
+    motions[0] = np.eye(4)  # Rodrigues: 1 + K^2 + K sin q - K^2 cos q
+    motions[0, :, :3, :3] += K @ K
+    motions[1, :, :3, :3], motions[2, :, :3, :3] = K, -(K @ K)
+    motions[3, :, :3, 3] = axes * ~revolute[:, None]
     between = f"'{robot['base']}' and '{', '.join(tips)}'"
-    driving = [joint for joint in drivers if joint["kind"] != "fixed"]
-    table = _coupling(moving, driving, fixed, f"robot '{robot['name']}'", between)
+    table = _coupling(robot, moving, between)
     places = np.array(offsets), np.array(before), tuple(tips), ground >= 0
-    return NominalChain(*places, axes, revolute, table[:, :-1].copy(), table[:, -1].copy())
+    return NominalChain(*places, axes, revolute, motions, table[:, :-1].copy(), table[:, -1].copy())
 
 
 def active_joints(robot: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -189,56 +78,41 @@ def active_joints(robot: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [joint for joint in every if joint["kind"] != "fixed" and joint["mimic"] is None]
 
 
-def _coupling(
-    moving: Sequence[Mapping[str, Any]],
-    drivers: Sequence[Mapping[str, Any]],
-    fixed: Sequence[str],
-    robot: str,
-    between: str,
-) -> Array:
-    """Values of all moving joints by those of the n active ones, and 1: (n_all, n + 1), rad or m.
-
-    Args:
-        moving: the n_all joints that move something. drivers: joints that drive some of these and move nothing else.
-        fixed: names of fixed joints. robot: which robot it is, for messages. between: links where its joints are.
-    """
-    every = [*moving, *drivers]
-    active = [joint["name"] for joint in every if joint["mimic"] is None]
-    units = np.eye(len(active) + 1)  # a column per active joint, one of constants
-    rows: dict[str, Any] = dict(zip(active, units, strict=False))
-    waiting = {joint["name"]: joint["mimic"] for joint in every if joint["mimic"] is not None}
-    names = {joint["name"] for joint in every}
-    for name, mimic in waiting.items():
-        for driver in mimic:
-            if driver not in names:
-                raise _no_driver(name, driver, robot, between, fixed=driver in fixed)
-    constants = {joint["name"]: joint["mimic_offset"] * units[-1] for joint in every}
-    while waiting:
-        ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
-        if not ready:
-            what = f"joints of {robot} mimic each other in a circle: {' -> '.join(_circle(waiting))}"
-            raise RobotError.of(what, fix="make one of them active")
-        for name in ready:
-            mimic = waiting.pop(name)
-            rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
-    return np.array([rows[joint["name"]] for joint in moving])
+def _coupling(robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], between: str) -> Array:
+    """Values of the n_all moving joints by those of the n active ones, and 1: (n_all, n + 1), rad or m."""
+    drivers = [joint for joint in robot.get("drivers", ()) if joint["kind"] != "fixed"]
+    mimics = {joint["name"]: joint["mimic"] or {} for joint in (*moving, *drivers)}
+    fixed = [joint["name"] for joint in (*robot["joints"], *robot.get("drivers", ())) if joint["name"] not in mimics]
+    active, place = [joint["name"] for joint in active_joints(robot)], list(mimics).index
+    slopes, start = np.zeros((len(mimics), len(mimics))), np.zeros((len(mimics), len(active) + 1))
+    start[:, -1] = [joint["mimic_offset"] for joint in (*moving, *drivers)]
+    start[[place(name) for name in active]] = np.eye(*start[: len(active)].shape)
+    for row, (name, mimic) in enumerate(mimics.items()):
+        for driver, slope in mimic.items():
+            if driver not in mimics:
+                what = f"joint '{name}' of robot '{robot['name']}' mimics '{driver}', which is "
+                fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
+                if driver not in fixed:
+                    what += f"not a joint between {between}"
+                    fix = "choose a base and a tip with that joint between them, correct its name, or make it active"
+                raise RobotError.of(what + "fixed" * (driver in fixed), fix=fix)
+            slopes[row, place(driver)] = slope
+    by_driver, rows = slopes != 0, start
+    ways = by_driver
+    for _ in mimics:
+        ways, rows = ways @ by_driver, slopes @ rows + start
+    if ways.any():
+        circle = _circle(mimics, {name for name in mimics if ways[place(name)].any()})
+        what = f"joints of robot '{robot['name']}' mimic each other in a circle: {' -> '.join(circle)}"
+        raise RobotError.of(what, fix="make one of them active")
+    return rows[: len(moving)]
 
 
-def _no_driver(name: str, driver: str, robot: str, between: str, *, fixed: bool) -> RobotError:
-    """The error of a joint that mimics one that does not move, or that is not there."""
-    what = f"joint '{name}' of {robot} mimics '{driver}'"
-    if fixed:
-        fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
-        return RobotError.of(f"{what}, which is fixed", fix=fix)
-    fix = "choose a base and a tip with that joint between them, correct its name, or make the joint active"
-    return RobotError.of(f"{what}, which is not a joint between {between}", fix=fix)
-
-
-def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of joints in one circle, closed by the first; every joint of ``waiting`` mimics another one of them."""
-    path = [next(iter(waiting))]
+def _circle(mimics: Mapping[str, Mapping[str, float]], endless: Collection[str]) -> list[str]:
+    """Names of joints in one circle, closed by the first, among those that lead to one."""
+    path = [next(name for name in mimics if name in endless)]
     while True:
-        driver = next(name for name in waiting[path[-1]] if name in waiting)
+        driver = next(name for name in mimics[path[-1]] if name in endless)
         if driver in path:
             return [*path[path.index(driver) :], driver]
         path.append(driver)
@@ -262,20 +136,7 @@ def calibrated_chain(
         offsets, constant = offsets @ transforms(twists[1:]), np.zeros_like(twists[1:])
     else:
         constant = twists[1:]
-    return CalibratedChain(
-        start=base @ transforms(twists[0]),
-        offsets=offsets,
-        twists=constant,
-        tips=nominal.offsets[L : L + T],
-        before=nominal.before,
-        ancestors=nominal.ancestors,
-        motions=nominal.motion_terms,
-        axes=nominal.axes,
-        revolute=nominal.revolute,
-        coupling=nominal.coupling,
-        coupling_offset=nominal.coupling_offset,
-        sag=sag,
-    )
+    return CalibratedChain(nominal, base @ transforms(twists[0]), offsets, constant, nominal.offsets[L : L + T], sag)
 
 
 def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
@@ -291,21 +152,8 @@ def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
         else:
             forces[k] = c[0]
         directions[k, compliance.joint] = compliance.direction
-    moved, signs = nominal.seen_from_ground
     axes, joints = np.array([c.axis for c in own]), np.array([c.joint for c in own])
-    flat = moments.reshape(-1, 3 * F), forces, directions.reshape(-1, 6 * L)
-    return Sag(nominal.offsets, nominal.before, nominal.grounded, moved.astype(float), signs, joints, axes, *flat)
-
-
-def perpendicular(axis: Array) -> Array:
-    """Two unit vectors perpendicular to a unit vector (3,) and to each other: (2, 3).
-
-    Rows of the Householder reflection that maps the first axis to +-``axis``. Coefficients in model files refer to
-    them, so that they must not depend on a library's choice of basis.
-    """
-    v = axis.copy()
-    v[0] += 1.0 if axis[0] >= 0 else -1.0
-    return (np.eye(3) - 2.0 * np.outer(v, v) / (v @ v))[1:]
+    return Sag(joints, axes, moments.reshape(-1, 3 * F), forces, directions.reshape(-1, 6 * L))
 
 
 def recorded_flow(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import factorial
 from typing import Any
 
@@ -19,6 +20,8 @@ import numpy as np
 from diffeo_calib.runtime.arrays import ONE, Array, cross, skew, transforms
 from diffeo_calib.runtime.flow import NUMPY, Operations
 
+COINCIDENT_FRAMES_M = 1e-6
+"""Frames whose origins are closer than this [m] count as one place for masses."""
 SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
@@ -59,27 +62,123 @@ def waves_of(config: Sequence[Sequence[float]], size: int, coefficients: Array) 
 
 
 @dataclass(frozen=True, eq=False)
+class Compliance:
+    """The sag of a joint's frame in one direction, and its family of features; see robots/gravity.py.
+
+    Args:
+        joint: number of the moving joint whose frame sags.
+        direction: (6,) unit twist in the frame before the joint's motion, translation first.
+        own: whether it is along the joint's own motion (else lateral).
+        places: numbers of the places at which masses pull; empty for a slide along its axis, where the feature is the
+            force itself.
+        loaded: whether the load is the payload, whose mass is known.
+    """
+
+    joint: int
+    direction: Array
+    own: bool
+    places: tuple[int, ...]
+    loaded: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of its features."""
+        return 3 * max(len(self.places), 1)
+
+    @property
+    def axis(self) -> Array:
+        """(3,) the unit vector along which it slides, or about which it turns."""
+        return self.direction[3:] if self.places else self.direction[:3]
+
+
+@dataclass(frozen=True, eq=False)
+class NominalChain:
+    """Constants of a robot, see robots/tree.py. Its F places are the frames of joints, tips, loads and the ground.
+
+    Args:
+        offsets: (F, 4, 4) constant transforms of the places [m]. before: (F,) the moving joints before them, or -1.
+        tips: names of the tips. grounded: whether the last place is the ground; else it is the base.
+        axes: (n_all, 3) joint axes in their own frames. revolute: (n_all,) False for prismatic joints.
+        motions: (4, n_all, 4, 4) C, S, D, L.
+        coupling: (n_all, n), coupling_offset: (n_all,): moving joints' values from the active ones'.
+    """
+
+    offsets: Array
+    before: np.ndarray
+    tips: tuple[str, ...]
+    grounded: bool
+    axes: Array
+    revolute: np.ndarray
+    motions: Array
+    coupling: Array
+    coupling_offset: Array
+
+    @cached_property
+    def ancestors(self) -> np.ndarray:
+        """(F, n_all) whether joint l moves place f."""
+        found = np.zeros((len(self.before), len(self.axes)), dtype=bool)
+        for place, last in enumerate(self.before):
+            if last >= 0:
+                found[place] = found[last]
+                found[place, last] = True
+        return found
+
+    @cached_property
+    def moved(self) -> np.ndarray:
+        """(F, n_all) whether joint l moves place f as seen from the ground."""
+        between = self.ancestors[-1] & self.grounded  # what they move is on the base's side
+        return self.ancestors ^ between
+
+    @cached_property
+    def signs(self) -> Array:
+        """(n_all,) sense of the axes as seen from the ground."""
+        return np.where(self.ancestors[-1] & self.grounded, -1.0, 1.0)
+
+    @cached_property
+    def distinct(self) -> np.ndarray:
+        """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
+        far = np.linalg.norm(self.offsets[:, :3, 3], axis=1) > COINCIDENT_FRAMES_M
+        ends = (self.before < 0) & (np.arange(len(self.before)) >= len(self.axes))
+        return far | np.where(self.before < 0, ends, ~self.revolute[self.before])
+
+    @cached_property
+    def compliances(self) -> tuple[Compliance, ...]:
+        """Every joint's own compliance and its two lateral ones (three for a slide)."""
+        moved, found = self.moved & self.distinct[:, None], []
+        for joint, axis in enumerate(self.axes):
+            beyond = tuple(place for place in np.flatnonzero(moved[:, joint]).tolist() if place != joint)
+            if not self.revolute[joint]:
+                found.append(Compliance(joint, np.append(axis, np.zeros(3)), True, ()))
+            if beyond:
+                turns = np.pad([axis, *perpendicular(axis)], ((0, 0), (3, 0)))
+                own = bool(self.revolute[joint]), False, False
+                found += [Compliance(joint, *turn, beyond) for turn in zip(turns, own, strict=True)]
+        return tuple(found)
+
+
+def perpendicular(axis: Array) -> Array:
+    """Two unit vectors perpendicular to a unit vector (3,) and to each other: (2, 3).
+
+    Rows of the Householder reflection that maps the first axis to +-``axis``. Coefficients in model files refer to
+    them, so that they must not depend on a library's choice of basis.
+    """
+    v = axis.copy()
+    v[0] += 1.0 if axis[0] >= 0 else -1.0
+    return (np.eye(3) - 2.0 * np.outer(v, v) / (v @ v))[1:]
+
+
+@dataclass(frozen=True, eq=False)
 class Sag:
     """Gravity sag: twist coordinates e . m, with unit vectors e of nominal frames and moments m of unknown masses.
 
     The moments are linear in the origins o_f of the nominal frames: m_k = sum_f W_kf o_f + w_k.
 
     Args:
-        offsets: (F, 4, 4) nominal constant transforms of all places [m]. before: (F,) the joints before them, or -1.
-        grounded: whether the last place is the ground, in whose frame gravity is constant; else it is the base.
-        moved: (F, n_all) 1 where joint l moves place f as seen from the ground. signs: (n_all,) of the axes seen so.
-        joints: (K,) the moving joint of every coordinate.
-        axes: (K, 3) its unit vector in the joint's frame.
-        moments: (3 K, 3 F) W.
-        forces: (K, 3) w, constant forces on prismatic joints.
+        joints: (K,) the moving joint of every coordinate. axes: (K, 3) its unit vector in the joint's frame.
+        moments: (3 K, 3 F) W. forces: (K, 3) w, constant forces on prismatic joints.
         directions: (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad].
     """
 
-    offsets: Array
-    before: np.ndarray
-    grounded: bool
-    moved: Array
-    signs: Array
     joints: np.ndarray
     axes: Array
     moments: Array
@@ -92,43 +191,29 @@ class CalibratedChain:
     """Constants of the formula in the module's docstring.
 
     Args:
-        start: (4, 4) the base in the measuring frame [m].
+        nominal: the robot. start: (4, 4) the base in the measuring frame [m].
         offsets: (n_all, 4, 4) A_l [m]; constant error twists are multiplied in where there is no sag.
         twists: (n_all, 6) constant error twists tau_l [m, rad]; zero where they are multiplied in.
-        tips: (T, 4, 4) O_tip [m].
-        before: (F,) the moving joint before every place, -1 for the base; joints first, then tips.
-        ancestors: (F, n_all) whether joint l moves place f.
-        motions: (4, n_all, 4, 4) C, S, D, L.
-        axes: (n_all, 3) joint axes in their own frames.
-        revolute: (n_all,) False for prismatic joints.
-        coupling: (n_all, n), coupling_offset: (n_all,): moving joints' values from the active ones'.
-        sag: gravity sag; None without it.
-        waves: of the active joints; None without.
+        tips: (T, 4, 4) O_tip [m]. sag: gravity sag. waves: of the active joints; None without.
     """
 
+    nominal: NominalChain
     start: Array
     offsets: Array
     twists: Array
     tips: Array
-    before: np.ndarray
-    ancestors: np.ndarray
-    motions: Array
-    axes: Array
-    revolute: np.ndarray
-    coupling: Array
-    coupling_offset: Array
     sag: Sag | None = None
     waves: Waves | None = None
 
     @property
     def n(self) -> int:
         """Number of active joints."""
-        return self.coupling.shape[1]
+        return self.nominal.coupling.shape[1]
 
     @property
     def serial(self) -> bool:
         """Whether the joints follow one another to a single tip, and nothing else bends them."""
-        return len(self.before) == len(self.axes) + 1 and self.before.tolist() == list(range(-1, len(self.axes)))
+        return self.nominal.before.tolist() == list(range(-1, len(self.nominal.axes)))
 
     def poses(self, q: Array) -> Array:
         """Poses of the tips in the measuring frame: (N, n) -> (N, T, 4, 4) [m]."""
@@ -139,31 +224,31 @@ class CalibratedChain:
 
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
-        motions, L = joint_motions(self, q if self.waves is None else turned(self.waves, q)), len(self.axes)
-        nominal = None if self.sag is None else nominal_frames(self.sag, motions)
+        robot, L = self.nominal, len(self.nominal.axes)
+        motions = joint_motions(robot, q if self.waves is None else turned(self.waves, q))
+        nominal = None if self.sag is None else nominal_frames(robot, motions)
         twists = self.twists[None] if nominal is None else error_twists(self, nominal)
         offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
         links = link_frames(self, offsets @ motions)
         links[0] = np.broadcast_to(self.start, (len(q), 4, 4))
-        before = np.stack([links[number + 1] for number in self.before[: len(self.axes)]], axis=1)
+        before = np.stack([links[number + 1] for number in robot.before[:L]], axis=1)
         frames = before @ self.offsets  # without and with their error twists: (N, L, 4, 4)
         bent = frames if nominal is None else before @ offsets
         tips = ends(self, links)
         R, arms = bent[..., :3, :3], tips[:, :, None, :3, 3] - bent[:, None, :, :3, 3]  # (N, L, 3, 3), (N, T, L, 3)
-        on_path = self.ancestors[len(self.axes) :][: len(self.tips), :, None]  # (T, L, 1)
-        z = np.broadcast_to((R @ self.axes[..., None])[..., 0][:, None], arms.shape)
-        linear = np.where(self.revolute[:, None], cross(z, arms), z) * on_path
-        angular = np.where(self.revolute[:, None], z, 0.0) * on_path
+        on_path = robot.ancestors[L:][: len(self.tips), :, None]  # (T, L, 1)
+        z = np.broadcast_to((R @ robot.axes[..., None])[..., 0][:, None], arms.shape)
+        linear = np.where(robot.revolute[:, None], cross(z, arms), z) * on_path
+        angular = np.where(robot.revolute[:, None], z, 0.0) * on_path
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
         if self.sag is not None:
-            amounts = load_slopes(self.axes, self.revolute, self.sag, nominal)
-            slopes = (self.sag.directions.T @ amounts).reshape(len(q), L, 6, L)
+            slopes = (self.sag.directions.T @ load_slopes(robot, self.sag, nominal)).reshape(len(q), L, 6, L)
             shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
             turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
             moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
             sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
             by_moving = by_moving + np.concatenate(sums, axis=2)
-        found = by_moving @ self.coupling
+        found = by_moving @ robot.coupling
         return tips, found if self.waves is None else found * self.waves.slopes(q)[:, None, None]
 
 
@@ -174,10 +259,10 @@ def tip_poses(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
         chain: the constants of a :class:`CalibratedChain`, as arrays of the library. q: joint values.
         use: the library; NumPy by default.
     """
-    motions = joint_motions(chain, q if chain.waves is None else turned(chain.waves, q, use), use)
+    motions = joint_motions(chain.nominal, q if chain.waves is None else turned(chain.waves, q, use), use)
     offsets = chain.offsets
     if chain.sag is not None:
-        offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.sag, motions, use)))
+        offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.nominal, motions, use)))
     return ends(chain, link_frames(chain, offsets @ motions), use)
 
 
@@ -187,37 +272,36 @@ def turned(waves: Any, x: Any, use: Operations = NUMPY) -> Any:
     return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
 
 
-def joint_motions(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
-    """J_l: (N, n_all, 4, 4)."""
-    x = (q @ chain.coupling.T + chain.coupling_offset)[..., None, None]
-    C, S, D, L = chain.motions
+def joint_motions(robot: Any, q: Any, use: Operations = NUMPY) -> Any:
+    """J_l of a nominal chain: (N, n_all, 4, 4)."""
+    x = (q @ robot.coupling.T + robot.coupling_offset)[..., None, None]
+    C, S, D, L = robot.motions
     motions = C + S * use.sin(x) + D * use.cos(x)
-    return motions if all(chain.revolute) else motions + L * x
+    return motions if all(robot.revolute) else motions + L * x
 
 
 def link_frames(chain: Any, steps: Any) -> list[Any]:
     """The base (4, 4), then the link after every joint (N, 4, 4), from their steps A_l T(tau_l) J_l."""
     links = [chain.start]
     for joint in range(steps.shape[1]):
-        links.append(links[chain.before[joint] + 1] @ steps[:, joint])
+        links.append(links[chain.nominal.before[joint] + 1] @ steps[:, joint])
     return links
 
 
 def ends(chain: Any, links: Sequence[Any], use: Operations = NUMPY) -> Any:
     """Poses of the tips on their links: (N, T, 4, 4)."""
     L = len(links) - 1
-    return use.stack([links[number + 1] for number in chain.before[L : L + len(chain.tips)]], 1) @ chain.tips
+    return use.stack([links[number + 1] for number in chain.nominal.before[L : L + len(chain.tips)]], 1) @ chain.tips
 
 
-def nominal_frames(sag: Any, motions: Any, use: Operations = NUMPY) -> Any:
+def nominal_frames(robot: Any, motions: Any, use: Operations = NUMPY) -> Any:
     """Nominal frames of all places on the ground: (N, F, 4, 4)."""
     poses: list[Any] = []
-    for place, before in enumerate(sag.before):
-        offset = sag.offsets[place]
+    for offset, before in zip(robot.offsets, robot.before, strict=True):
         on_base = use.broadcast_to(offset, motions[:, 0].shape)
         poses.append(on_base if before < 0 else poses[before] @ motions[:, before] @ offset)
     found = use.stack(poses, 1)
-    return use.inverse(found[:, -1:]) @ found if sag.grounded else found
+    return use.inverse(found[:, -1:]) @ found if robot.grounded else found
 
 
 def error_twists(chain: Any, nominal: Any) -> Any:
@@ -233,19 +317,22 @@ def loads(sag: Any, nominal: Any) -> tuple[Any, Any]:
     return e, m.reshape(e.shape) + sag.forces
 
 
-def load_slopes(axes: Any, revolute: Any, sag: Any, nominal: Any) -> Any:
+def load_slopes(robot: Any, sag: Any, nominal: Any) -> Any:
     """Derivatives of the twist coordinates e . m by the moving joints: (N, K, n_all).
 
     Turning joint k moves what it carries, M_fk = 1, by z_k x (o_f - o_k), a slide by z_k; e turns where M_lk = 1.
+
+    Args:
+        robot: axes, revolute, moved, signs of a :class:`NominalChain`. nominal: (N, F, 4, 4) see nominal_frames.
     """
-    (N, F), L = nominal.shape[:2], len(axes)
+    (N, F), L, revolute = nominal.shape[:2], len(robot.axes), robot.revolute[:, None]
     e, m = loads(sag, nominal)
-    z = (nominal[:, :L, :3, :3] @ axes[..., None])[..., 0] * sag.signs[:, None]  # (N, L, 3)
-    origins, spun = nominal[..., :3, 3], (z * revolute[:, None])[:, None]  # (N, F, 3), (N, 1, L, 3)
-    moved = cross(spun, origins[:, :, None] - origins[:, None, :L]) + (z * ~revolute[:, None])[:, None]
-    moved = moved * sag.moved[None, :, :, None]  # (N, F, L, 3)
+    z = (nominal[:, :L, :3, :3] @ robot.axes[..., None])[..., 0] * robot.signs[:, None]  # (N, L, 3)
+    origins, spun = nominal[..., :3, 3], (z * revolute)[:, None]  # (N, F, 3), (N, 1, L, 3)
+    moved = cross(spun, origins[:, :, None] - origins[:, None, :L]) + (z * ~revolute)[:, None]
+    moved = moved * robot.moved[None, :, :, None]  # (N, F, L, 3)
     slopes_m = (sag.moments @ moved.swapaxes(2, 3).reshape(N, 3 * F, L)).reshape(*e.shape, L)
-    slopes_e = cross(spun, e[:, :, None]) * sag.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
+    slopes_e = cross(spun, e[:, :, None]) * robot.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
     return (e[:, :, None] @ slopes_m)[:, :, 0] + (slopes_e @ m[..., None])[..., 0]
 
 

@@ -9,7 +9,7 @@ from product_bank import Case
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.runtime.build import perpendicular
+from diffeo_calib.runtime.chain import perpendicular
 
 
 def test_arrays_that_run_backwards(arm: Case) -> None:

@@ -13,7 +13,7 @@ from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm, simulated_
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.build import Compliance
+from diffeo_calib.runtime.chain import Compliance
 
 UPRIGHT, ON_A_WALL = (0.0, 0.0, -9.81), (-6.0, 2.0, 5.0)
 

@@ -130,7 +130,7 @@ def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) 
     places = places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
     frame = places[:, joint]
     axis = (frame[:, :3, :3] @ e[:, None])[..., 0]
-    carried = torch.from_numpy(robot.arrays.seen_from_ground[0][:, joint]).to(q)
+    carried = torch.from_numpy(robot.arrays.moved[:, joint]).to(q)
     h = 1e-5
     energies = []
     for sign in (1.0, -1.0):
@@ -145,7 +145,7 @@ def test_features_are_moments_of_everything_that_a_joint_carries(robot: Tree) ->
     sag, q = GravitySag(robot), draw(robot, 12)
     rng = torch.Generator().manual_seed(1)
     masses = torch.rand(len(robot.before), dtype=torch.float64, generator=rng)
-    masses[~torch.from_numpy(robot.arrays.seen_from_ground[0]).any(1)] = 0.0
+    masses[~torch.from_numpy(robot.arrays.moved).any(1)] = 0.0
     features = sag.features(q).split([c.size for c in sag.compliances], dim=1)
     for compliance, values in zip(sag.compliances, features, strict=True):
         only = torch.zeros_like(masses)
