@@ -33,12 +33,7 @@ def flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]:
 
 
 def _term_constants(name: str, term: RadialTerm) -> dict[str, Any]:
-    """A term whose controls come in blocks, without the components that it does not move.
-
-    ``outputs`` are the components that it moves. ``width``: components of a weight, an even number if they are
-    several, since vector registers hold pairs. ``features``: (S, blocks, D, LANES), ``weights``: (S, blocks, LANES,
-    width). ``constant``: sum of s^2 over the circles; half the squared distance is that minus a product of features.
-    """
+    """A term whose controls come in blocks, without the components that it does not move."""
     outputs = np.flatnonzero(term.weights.any(axis=(0, 1)))
     width = len(outputs) + (len(outputs) % 2 if len(outputs) > 1 else 0)
     every, features = np.arange(term.weights.shape[2]), term.features
@@ -63,10 +58,7 @@ def _blocks(values: Array) -> Array:
 
 
 def _table_constants(tables: JointTables) -> dict[str, Any]:
-    """Tables of all stages and joints, one after the other: knots (rows,) rad, and f, f', f'' (rows, 3) there.
-
-    ``first`` is the first row of every table, stage by stage, and the number of rows.
-    """
+    """Tables of all stages and joints, one after the other: knots (rows,) rad, and f, f', f'' (rows, 3) there."""
     every = [table for stage in tables.stages for table in stage]
     return {
         "joints": np.flatnonzero(tables.selection.any(0)),

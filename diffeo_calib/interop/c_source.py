@@ -37,9 +37,7 @@ class CFiles:
     """A source file and its header.
 
     Args:
-        source, header: their paths.
-        prefix: of the names of the functions.
-        texts: contents of both.
+        source, header: their paths. prefix: of the names of the functions. texts: contents of both.
     """
 
     source: Path
@@ -91,13 +89,9 @@ def write_c(
         tip: that carries the tool, for a robot with several; the model's own by default. The other branches bend the
             robot by their weight: the functions take the values of all joints.
 
-    Returns:
-        What was written.
-
-    Raises:
-        InputError: a model with adaptive time steps or a user's kernel, whose flows are no constants, or on another
-            device than the CPU; another frame; several tips of which none is named; a path without ``.c``, or to a
-            file of other origin; a prefix that is no name in C.
+    Returns what was written. Raises InputError: a model with adaptive time steps or a user's kernel, whose flows are no
+    constants, or on another device than the CPU; another frame; several tips of which none is named; a path without
+    ``.c``, or to a file of other origin; a prefix that is no name in C.
     """
     files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
     files.write()

@@ -26,8 +26,7 @@ def camera_files(
             place belongs to; the model's own by default. on_tool: whether the camera is on the tool; needed
             where poses of the board were measured.
 
-    Raises:
-        InputError: a model without such a camera, or one that was registered again.
+    Raises InputError: a model without such a camera, or one that was registered again.
     """
     cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
     if not cameras and (model.lever is None or on_tool is None):

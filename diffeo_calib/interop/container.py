@@ -30,8 +30,7 @@ Header = dict[str, Any]
 def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     """Header and arrays of a file, after checking its format and checksum.
 
-    Raises:
-        ModelFileError: the file cannot be read, or has another format or a wrong checksum.
+    Raises ModelFileError: the file cannot be read, or has another format or a wrong checksum.
     """
     if not path.is_file():
         raise ModelFileError.of(f"there is no model file {path}", fix="check the path")

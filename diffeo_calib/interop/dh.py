@@ -43,10 +43,8 @@ class DHTable:
     """A Denavit-Hartenberg table with what it cannot hold.
 
     Args:
-        names: names of the moving joints, one per row.
-        rows: see :class:`DHRow` [m, rad].
-        convention: "standard" or "craig".
-        base: (4, 4) from the robot's base to the frame before the first row [m].
+        names: names of the moving joints, one per row. rows: see :class:`DHRow` [m, rad].
+        convention: "standard" or "craig". base: (4, 4) from the robot's base to the frame before the first row [m].
         tool: (4, 4) from the frame after the last row to the tip [m].
     """
 
@@ -76,9 +74,8 @@ def dh_table(
         convention: "standard" or "craig" (also called modified).
         tip: at the end of the table, for a robot with several: its joints are those of the path to this tip.
 
-    Raises:
-        InputError: another convention, several tips of which none is named, or mimic joints on the path that joints of
-            another branch drive.
+    Raises InputError: another convention, several tips of which none is named, or mimic joints on the path that joints
+    of another branch drive.
     """
     if convention not in CONVENTIONS:
         raise InputError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
@@ -121,12 +118,10 @@ def write_dh(
     (R = Rz(yaw) Ry(pitch) Rx(roll)); all other rows are joints.
 
     Args:
-        kinematics, convention, tip: as :func:`dh_table`.
-        path: the file to write.
+        kinematics, convention, tip: as :func:`dh_table`. path: the file to write.
         length: "m" or "mm". angle: "rad" or "deg".
 
-    Raises:
-        InputError: another convention or unit, or a file that cannot be written.
+    Raises InputError: another convention or unit, or a file that cannot be written.
     """
     check_units(length, angle)
     write_whole(path, dh_text(dh_table(kinematics, convention, tip), length, angle).encode())
@@ -158,8 +153,7 @@ def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], 
 
     Frames are in the robot's base. ``tip`` is named for a robot with several.
 
-    Raises:
-        InputError: no such tip, or none named.
+    Raises InputError: no such tip, or none named.
     """
     chain = geometry.chain
     name = checked_tip(chain, tip)
@@ -180,8 +174,7 @@ def links(
         frames: n frames of the joints (4, 4) [m]. axes: (n, 3) their axes. tip: (4, 4) frame of the tip.
         start: (4, 4); the first frame is on the first axis, next to it, with its x axis turned as little as possible.
 
-    Returns:
-        n rows; the frame before the first; the frames after each.
+    Returns n rows; the frame before the first; the frames after each.
     """
     lines = [(frame[:3, :3] @ axis, frame[:3, 3]) for frame, axis in zip(frames, axes, strict=True)]
     before = at = on_axis(start, *lines[0])

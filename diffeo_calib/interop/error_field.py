@@ -28,8 +28,7 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
         model: of a machine with commanded places or poses, see :func:`diffeo_calib.cartesian`.
         grid: numbers of points along each axis, such as "5x5x3". length: unit in the file.
 
-    Raises:
-        InputError: a model of joint values, another number of axes, or more than 100,000 points.
+    Raises InputError: a model of joint values, another number of axes, or more than 100,000 points.
     """
     robot, counts = model.robot, [int(word) if word.isdigit() else 0 for word in grid.lower().split("x")]
     axes = min(robot.n, len(SLIDES))

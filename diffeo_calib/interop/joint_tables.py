@@ -64,8 +64,7 @@ def correction_tables(
         model: calibrated kinematics.
         turn_step: distance between rows of revolute joints [rad]. slide_step: of prismatic joints [m].
 
-    Raises:
-        InputError: a step that is not positive, or tables of more than 100,000 rows.
+    Raises InputError: a step that is not positive, or tables of more than 100,000 rows.
     """
     check_number(turn_step, "`turn_step`", above=0.0)
     check_number(slide_step, "`slide_step`", above=0.0)
@@ -83,8 +82,7 @@ def write_correction_tables(
     Args:
         model: see :func:`correction_tables`. path: the file. length: "m" or "mm". angle: "rad" or "deg".
 
-    Raises:
-        InputError: another unit, or a file that cannot be written.
+    Raises InputError: another unit, or a file that cannot be written.
     """
     check_units(length, angle)
     write_whole(path, tables_text(correction_tables(model), length, angle).encode())
@@ -98,8 +96,7 @@ def write_joint_offsets(
     Args:
         model: see :func:`best_joint_offsets`. path: the file. length: "m" or "mm". angle: "rad" or "deg".
 
-    Raises:
-        InputError: another unit, or a file that cannot be written.
+    Raises InputError: another unit, or a file that cannot be written.
     """
     check_units(length, angle)
     write_whole(path, offsets_text(best_joint_offsets(model), model.robot, length, angle).encode())

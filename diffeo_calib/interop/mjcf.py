@@ -43,10 +43,8 @@ def write_mjcf(kinematics: CalibratedKinematics | Geometry, path: str | PathLike
             these kinematics themselves.
         path: the file to write.
 
-    Raises:
-        InputError: a base that is not above all other links, a mimic joint that several joints drive, or one that is
-            not in the chain, or the file cannot be written.
-        RobotError: masses or inertias in the URDF that are no numbers.
+    Raises InputError: a base that is not above all other links, a mimic joint that several joints drive, or one that is
+    not in the chain, or the file cannot be written. RobotError: masses or inertias in the URDF that are no numbers.
     """
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     write_whole(path, mjcf_text(geometry).encode())

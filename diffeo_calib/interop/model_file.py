@@ -116,8 +116,7 @@ def _is_class(given: object, kinds: type | tuple[type, ...]) -> bool:
 def read(path: Path) -> tuple[Header, Tensors]:
     """Header and tensors of a file, after checking its format and checksum.
 
-    Raises:
-        ModelFileError: the file cannot be read, or has another format or a wrong checksum.
+    Raises ModelFileError: the file cannot be read, or has another format or a wrong checksum.
     """
     header, arrays = read_arrays(path)
     return header, {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}

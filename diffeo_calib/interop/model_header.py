@@ -75,8 +75,7 @@ class MissingArgumentError(InputError):
 def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     """The contents of a model's file: its header without checksum, and its tensors.
 
-    Raises:
-        InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
+    Raises InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
     seen = model.map if isinstance(model, CalibratedKinematics) else model
     if not isinstance(seen, FittedMap):
@@ -163,13 +162,11 @@ def rebuild(
     """The model that a header and tensors describe.
 
     Args:
-        header, tensors: the output of :func:`describe`.
-        nominal: the nominal map, for a model of a plain function.
+        header, tensors: the output of :func:`describe`. nominal: the nominal map, for a model of a plain function.
         kernels: kernel classes and profiles that are not part of the package, by name of the class or profile.
 
-    Raises:
-        MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing, or is another one than that of the fit.
-        ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
+    Raises MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing, or is another one than that of the
+    fit. ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
     if set(header) - OPTIONAL != known or header["units"] != UNITS:
@@ -360,11 +357,7 @@ def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
 
 
 def rebuild_payload(entry: Mapping[str, Any] | None) -> Payload | None:
-    """The payload that a robot carries in all queries, by its entry.
-
-    Raises:
-        InputError: numbers that are no masses.
-    """
+    """The payload that a robot carries in all queries, by its entry. Raises InputError: numbers that are no masses."""
     if entry is None:
         return None
     mass, unit = (float(entry[name]) for name in ("mass", "unit"))
@@ -376,8 +369,7 @@ def rebuild_payload(entry: Mapping[str, Any] | None) -> Payload | None:
 def rows_with_payloads(nominal: NominalMap, tensors: Mapping[str, Tensor]) -> GeometryMap | None:
     """k0 at the controls, each with its own payload; None without payloads.
 
-    Raises:
-        InputError: not one mass for each control.
+    Raises InputError: not one mass for each control.
     """
     if not isinstance(nominal, GeometryMap) or nominal.payload is None:
         return None
@@ -407,8 +399,7 @@ def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str
 def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Registration:
     """The inverse of :func:`describe_registration`; ``n`` is the number of joints.
 
-    Raises:
-        InputError: entries that are missing or do not fit together.
+    Raises InputError: entries that are missing or do not fit together.
     """
     if not isinstance(entry, dict) or set(entry) - {LEARNT, TABLE} != set(ENTRIES):
         got = sorted(entry) if isinstance(entry, dict) else entry
@@ -449,8 +440,7 @@ def describe_sessions(fitted: FittedMap) -> dict[str, Tensor]:
 def rebuild_sessions(nominal: NominalMap, tensors: dict[str, Tensor]) -> SessionMarkers | None:
     """The inverse of :func:`describe_sessions`: k0 at the controls.
 
-    Raises:
-        InputError: tensors that do not fit together.
+    Raises InputError: tensors that do not fit together.
     """
     if SHARED not in tensors:
         return None

@@ -26,8 +26,7 @@ class NumpyKinematics:
     """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`.
 
     Args:
-        program: the model as constants.
-        joint_names: names of the n joints, in the order of the columns of ``q``.
+        program: the model as constants. joint_names: names of the n joints, in the order of the columns of ``q``.
         limits: (n, 2) their lower and upper limits, rad or m; infinite without one.
         tool: (4, 4) tool centre point in the tip's frame, m.
     """
@@ -55,8 +54,7 @@ class NumpyKinematics:
             frame: "base" of the robot, as it was found, or "measuring".
             tip: name of the tip that carries the tool, for a robot with several.
 
-        Raises:
-            InputError: wrong shapes, values that are not finite, or another frame.
+        Raises InputError: wrong shapes, values that are not finite, or another frame.
         """
         return self._at(tip, frame).poses(self._joints(q), self._tool(tool), frame)
 
@@ -107,13 +105,10 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     Args:
         path: a file written by ``dc.save`` or ``diffeo-calib fit``.
 
-    Returns:
-        a :class:`NumpyKinematics`, with the payload that the model carries. It integrates the flows' controls and makes
-        tables of the transmission terms: half a second for 450 control points.
-
-    Raises:
-        ModelFileError: as :func:`diffeo_calib.load`.
-        InputError: a model of a plain function, with adaptive time steps, or with kernels of the user's own.
+    Returns a :class:`NumpyKinematics`, with the payload that the model carries. It integrates the flows' controls and
+    makes tables of the transmission terms: half a second for 450 control points. Raises ModelFileError: as
+    :func:`diffeo_calib.load`. InputError: a model of a plain function, with adaptive time steps, or with kernels of the
+    user's own.
     """
     header, arrays = read_arrays(Path(path))
     try:

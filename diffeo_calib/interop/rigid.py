@@ -53,8 +53,7 @@ class RigidKinematics:
     """Rigid kinematics in place of a calibrated model, and how far they are from it.
 
     Args:
-        geometry: chain, joint errors, base in the measuring frame and markers.
-        how: what they are, in words.
+        geometry: chain, joint errors, base in the measuring frame and markers. how: what they are, in words.
         rms: root mean square distance of the markers from the model's at the configurations that are compared, m.
         largest: largest such distance, m.
         validated: name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold

@@ -31,9 +31,13 @@ from diffeo_calib.robots.tree import Tree
 class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Marker positions from joint values, for pipelines, cross-validation and comparisons with other regressors.
 
+    X is (N, n), rad or m, columns in the robot's order; a data frame has columns named after the joints, in any order,
+    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden.
+    ``score`` is R^2,
+    as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
+
     Args:
-        robot: nominal chain of n joints.
-        on: names of the tips that carry the markers, for a robot with several.
+        robot: nominal chain of n joints. on: names of the tips that carry the markers, for a robot with several.
         lever: of measured poses, m: y then holds three points for each, as of
             :func:`diffeo_calib.measurements.poses.mark_points`; None for markers.
         hyperparameters, controls, seed: see :func:`diffeo_calib.calibrate`.
@@ -41,11 +45,6 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Attributes:
         result_: the :class:`CalibrationResult` of the fit. model_: its calibrated kinematics.
         n_features_in_: n. feature_names_in_: names of the columns if X was a data frame.
-
-    X is (N, n), rad or m, columns in the robot's order; a data frame has columns named after the joints, in any order,
-    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden.
-    ``score`` is R^2,
-    as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
     """
 
     result_: CalibrationResult
@@ -75,8 +74,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X: (N, n) joint values, rad or m. y: (N, 3 P) marker positions, m; or the rows themselves, a table of any
                 kind of measurement with these joint values.
 
-        Raises:
-            InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
+        Raises InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
         """
         if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
@@ -130,8 +128,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Args:
             X: (M, n) joint values, rad or m. return_std: whether to return the deviations as well.
 
-        Returns:
-            (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
+        Returns (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
         """
         check_is_fitted(self, "model_")
         q = self._in_order(self.model_.robot, validate_data(self, X, reset=False, dtype=np.float64))

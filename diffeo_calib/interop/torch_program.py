@@ -56,9 +56,8 @@ class TorchProgram(nn.Module):
         tool, frame: for "tool_poses", as there.
         dtype: of all numbers, input and output too: ``torch.float64``, or ``torch.float32`` (some micrometres).
 
-    Raises:
-        InputError: an unknown output or type, a tool for another output; a model in the paper's Eulerian formulation or
-            with time stepping by torchdiffeq.
+    Raises InputError: an unknown output or type, a tool for another output; a model in the paper's Eulerian formulation
+    or with time stepping by torchdiffeq.
     """
 
     def __init__(
@@ -135,9 +134,8 @@ def export_torch(
         model, output, tool, frame, dtype: see :class:`TorchProgram`.
         path: the file, ``*.pt2``; an existing file is replaced atomically.
 
-    Raises:
-        InputError: as :class:`TorchProgram`, or a file that cannot be written.
-        NumericalError: the program disagrees with the model.
+    Raises InputError: as :class:`TorchProgram`, or a file that cannot be written. NumericalError: the program disagrees
+    with the model.
     """
     contents, q = io.BytesIO(), _example(model, dtype)
     with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
@@ -172,8 +170,7 @@ def export_onnx(
         model, output, tool, frame, dtype: see :class:`TorchProgram`.
         path: the file, ``*.onnx``; an existing file is replaced atomically.
 
-    Raises:
-        InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
+    Raises InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
     """
     try:
         for name in ("onnx", "onnxscript"):

@@ -69,10 +69,8 @@ def write_ur_kinematics(
         hash: entry "hash", by which the driver compares the file with the controller's calibration: take that of the
             robot's own calibration file. Without it the driver reports that the file is not the controller's.
 
-    Raises:
-        RobotError: not one of these robots, or a URDF without tool0.
-        InputError: the model does not hold its URDF and ``robot`` is missing, a hash that is not one word, or the file
-            cannot be written.
+    Raises RobotError: not one of these robots, or a URDF without tool0. InputError: the model does not hold its URDF
+    and ``robot`` is missing, a hash that is not one word, or the file cannot be written.
     """
     if hash is not None and not re.fullmatch(r"[A-Za-z]\w*", hash, re.ASCII):
         expected, fix = "letters, digits and _", "copy the entry hash of the robot's own calibration file: calib_..."

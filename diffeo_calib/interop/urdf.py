@@ -50,12 +50,10 @@ def write_urdf(
     Args:
         kinematics: a calibrated model, of which the best rigid kinematics are taken (:func:`rigid_kinematics`), or
             these kinematics themselves.
-        path: the file to write.
-        robot: the URDF to correct, by default the one that the model was fitted with.
+        path: the file to write. robot: the URDF to correct, by default the one that the model was fitted with.
 
-    Raises:
-        InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
-        RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
+    Raises InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
+    RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
     """
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     content = corrected_urdf(geometry, urdf_of(geometry.chain, robot))
@@ -65,9 +63,7 @@ def write_urdf(
 def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
     """The content of the URDF that describes a chain: a file that is checked against it, or its own.
 
-    Raises:
-        InputError: no file is given, and the chain has none.
-        RobotError: the file describes another robot.
+    Raises InputError: no file is given, and the chain has none. RobotError: the file describes another robot.
     """
     if robot is None:
         if chain.source is None:

@@ -83,8 +83,7 @@ class DHFile:
     def read(cls, path: Path) -> DHFile:
         """Read a file; columns that say no unit have that with which the robot has the size of one, and right angles.
 
-        Raises:
-            RobotError: no such table, a cell that is no number, no unit of angles or limits, or two conventions.
+        Raises RobotError: no such table, a cell that is no number, no unit of angles or limits, or two conventions.
         """
         text = read_regular(path, "robot's description", LARGEST_FILE, RobotError).decode("utf-8-sig", "replace")
         lines = [line.strip() for line in text.translate(PLAIN).splitlines() if line.strip(" \t-:|+")]
@@ -113,8 +112,7 @@ class DHFile:
         Args:
             convention: "standard" or "craig", if the file does not say it. tip: name of the joint.
 
-        Raises:
-            RobotError: no convention, or another one than that of the file; no such joint.
+        Raises RobotError: no convention, or another one than that of the file; no such joint.
         """
         way = (self.convention if self.sure else convention or self.convention) or convention
         if not way or convention not in (None, way):
@@ -207,11 +205,7 @@ def _likely_units(rows: Sequence[Mapping[str, str]]) -> dict[str, str]:
 
 
 def _units_of_values(path: Path, rows: Sequence[Mapping[str, str]], units: Mapping[str, str]) -> dict[str, str]:
-    """Units of limits and of offsets of joints that turn, where the header has none: by their own size.
-
-    Raises:
-        RobotError: small ones beside angles in degrees, which may be either.
-    """
+    """Units of limits and of offsets of joints that turn, where the header has none: by their own size."""
     found = dict[str, str]()
     for names in (("lower", "upper"), ("offset",)):
         turning = [row for row in rows if _kind(row) == "revolute"]

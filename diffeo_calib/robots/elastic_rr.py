@@ -54,12 +54,10 @@ def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
     """The bent links of the real arm, to draw them.
 
     Args:
-        x: (N, 2) joint angles [rad].
-        scale: as in :func:`real`.
+        x: (N, 2) joint angles [rad]. scale: as in :func:`real`.
         samples: S, the number of points on each link after its first one.
 
-    Returns:
-        (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
+    Returns (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
     """
     x1, x2 = _angles(x)
     L1, L2 = (own + scale * (L - own) for own, L in zip(NOMINAL_LENGTHS, REAL_LENGTHS, strict=True))

@@ -25,8 +25,7 @@ class GearWaves:
         joints: numbers l of the active joints, K of them; a joint may have several waves.
         frequencies: w, rad per unit of the joint; for an angle, periods per turn.
 
-    Raises:
-        InputError: a negative joint number, or a frequency that is not positive.
+    Raises InputError: a negative joint number, or a frequency that is not positive.
     """
 
     joints: tuple[int, ...] = ()

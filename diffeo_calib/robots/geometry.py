@@ -39,14 +39,12 @@ class Geometry:
     """A robot with its base, error transforms and markers.
 
     Args:
-        chain: the nominal robot.
-        base: (4, 4) the robot's base in the measuring frame [m].
+        chain: the nominal robot. base: (4, 4) the robot's base in the measuring frame [m].
         joint_errors: (n_all, 4, 4) rigid transforms E_l [m], one for each of ``chain.moving_names``.
         tool: (P, 3) markers in the frames of their tips [m].
         on: P names of these tips, or one for all markers; the first of ``chain.tips`` for all by default.
 
-    Raises:
-        InputError: wrong shapes, values that are not finite, transforms that are not rigid, a tip that is not there.
+    Raises InputError: wrong shapes, values that are not finite, transforms that are not rigid, a tip that is not there.
     """
 
     chain: Tree

@@ -48,12 +48,11 @@ class GravitySag:
         chain: the nominal robot; its nominal frames make the features.
         payload: masses at a tip or at a branch without markers (`load`); None without.
 
-    Raises:
-        InputError: a payload at another link.
-
     Attributes:
         compliances: all compliances, those under the payload last; their features follow each other in the coefficients
             w (K,).
+
+    Raises InputError: a payload at another link.
     """
 
     def __init__(self, chain: Tree, payload: Payload | None = None) -> None:
@@ -131,8 +130,7 @@ class GravitySag:
 
         The payload then is one of the unknown masses at its place.
 
-        Raises:
-            InputError: a payload that differs between rows.
+        Raises InputError: a payload that differs between rows.
         """
         if self.payload is None:
             return w

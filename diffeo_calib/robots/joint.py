@@ -144,8 +144,7 @@ def walk(start: Tensor, offsets: Tensor, motions: Tensor, parents: Sequence[int]
         motions: (N, n_all, 4, 4) joint motions J_l; the first n_all of the F frames are those of the joints.
         parents: F numbers of the joints before the frames, -1 for the base; a joint follows its parent.
 
-    Returns:
-        Frames (N, F, 4, 4); those of joints are before the joint's motion.
+    Returns frames (N, F, 4, 4); those of joints are before the joint's motion.
     """
     base = start.expand(motions.shape[0], 4, 4)
     steps, moved, frames = motions.unbind(1), {-1: base}, []

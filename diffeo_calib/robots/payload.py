@@ -28,8 +28,7 @@ class Payload:
         masses: of the robot everywhere (), or of N rows (N,), in any unit.
         unit: the mass, in the same unit, that counts as one: coefficients are sags under it.
 
-    Raises:
-        InputError: a unit that is not positive.
+    Raises InputError: a unit that is not positive.
     """
 
     link: str
@@ -47,12 +46,8 @@ class Payload:
         Args:
             robot: n joints. masses: in any unit. at: name of the link that carried them; by default the only tip.
 
-        Raises:
-            MeasurementError: no mass at all, or a robot with several tips and no link named.
-            InputError: a link that is no tip and no load of the robot.
-
-        Warns:
-            DiffeoCalibWarning: the payload never changes.
+        Raises MeasurementError: no mass at all, or a robot with several tips and no link named. InputError: a link that
+        is no tip and no load of the robot. Warns DiffeoCalibWarning: the payload never changes.
         """
         if masses is None:
             return None
@@ -79,8 +74,7 @@ class Payload:
     def amounts(self, q: Tensor) -> Tensor:
         """The masses in units, one for each configuration (N, n) or one for all: (N, 1) or (1, 1).
 
-        Raises:
-            InputError: masses of another number of rows.
+        Raises InputError: masses of another number of rows.
         """
         if self.by_row and len(self.masses) != len(q):
             got, fix = f"{len(q)} configurations", "pass one mass for all configurations"
@@ -116,11 +110,7 @@ class Payload:
     def checked(self) -> Payload:
         """The same payload, if its masses can be meant.
 
-        Raises:
-            InputError: masses far above those of the fit.
-
-        Warns:
-            DiffeoCalibWarning: masses above those of the fit.
+        Raises InputError: masses far above those of the fit. Warns DiffeoCalibWarning: masses above those of the fit.
         """
         largest = float(self.masses.max()) if self.masses.numel() else 0.0
         got, measured = f"{largest:g}", f"0 to {self.unit:g} in the measurements of the fit"
@@ -222,12 +212,9 @@ def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> T
 
     Args:
         robot: the robot. name: of the new place, for :meth:`Measurements.with_payload`.
-        place: (3,) in the frame of a tip, m.
-        on: name of that tip; the only one by default.
+        place: (3,) in the frame of a tip, m. on: name of that tip; the only one by default.
 
-    Raises:
-        RobotError: a name that is taken, or an unknown tip.
-        InputError: no three numbers.
+    Raises RobotError: a name that is taken, or an unknown tip. InputError: no three numbers.
     """
     tip = robot.tip if on is None else on
     if tip not in robot.ends:

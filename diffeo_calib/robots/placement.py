@@ -143,15 +143,7 @@ class _Reduced(NamedTuple):
 
 
 def _reduce(sightings: _Sightings, weight: float) -> _Reduced:
-    """Eliminate markers and translation from  B (y_ik - y0) - t_ik = R_ik c_k + s,  B the inverse base rotation.
-
-    The equations are linear in (vec B, c, s). Centring eliminates s, a projection eliminates c, and a QR factor
-    represents the result without forming normal equations. Where the poses leave the markers undetermined (a planar
-    arm, a tool that never turns), the markers of smallest norm are taken and the base accounts for the difference.
-
-    Args:
-        weight: of the sum of the squared norms of the markers.
-    """
+    """Eliminate markers and translation from  B (y_ik - y0) - t_ik = R_ik c_k + s,  B the inverse base rotation."""
     poses, points, own = sightings
     S, P = own.shape
     centre = points.mean(0)
@@ -181,10 +173,7 @@ def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
-    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps.
-
-    Gauss-Newton alone needs a hundred steps where the residuals are large: rows that do not belong to the robot.
-    """
+    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps."""
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
     B = torch.cat([nearest_rotations(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)

@@ -96,8 +96,7 @@ def nearest_rotations(matrices: Tensor) -> Tensor:
 def rigid(value: object, name: str) -> Tensor:
     """Convert to a float64 (4, 4) rigid transform; ``name`` is used in messages.
 
-    Raises:
-        RobotError: a last row other than (0, 0, 0, 1), or a corner that is not a proper rotation.
+    Raises RobotError: a last row other than (0, 0, 0, 1), or a corner that is not a proper rotation.
     """
     matrix = as_tensor(value, name, (4, 4))
     corner = matrix[:3, :3]

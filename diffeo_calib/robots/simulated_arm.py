@@ -53,8 +53,7 @@ class Components:
     """The true contributions to the error at some configurations.
 
     Args:
-        transmission: (N, 6) true minus measured joint angles [rad].
-        gravity: (N, 6) gravity sag of the joints [rad].
+        transmission: (N, 6) true minus measured joint angles [rad]. gravity: (N, 6) gravity sag of the joints [rad].
         geometry: (N, P, 3) displacement of the markers by the geometric errors alone [m].
     """
 
@@ -68,22 +67,18 @@ class SimulatedArm:
     """A six-axis arm of about 1.1 m reach with known errors, watched by a laser tracker.
 
     Args:
-        seed: seed of the errors and of the places of tracker and markers.
-        markers: number of markers on the tool.
-        geometry: factor on the geometric errors; 0 switches them off.
-        transmission: factor on the transmission errors.
-        gravity: factor on the joint compliances.
-        noise: standard deviation of one measured coordinate [m].
+        seed: seed of the errors and of the places of tracker and markers. markers: number of markers on the tool.
+        geometry: factor on the geometric errors; 0 switches them off. transmission: factor on the transmission errors.
+        gravity: factor on the joint compliances. noise: standard deviation of one measured coordinate [m].
         payload: mass at the flange [kg], where the methods are given no other.
         lines: joint number, waves per turn and amplitude [rad] of further transmission errors, such as those of
             reduction gears at multiples of their ratio; their phases are drawn.
 
-    Raises:
-        InputError: a negative factor, noise or payload, no marker, or a line of a joint that is not there.
-
     Attributes:
         nominal: the chain as its maker publishes it.
         truth: the true geometry: base in the tracker's frame, joint errors, markers.
+
+    Raises InputError: a negative factor, noise or payload, no marker, or a line of a joint that is not there.
     """
 
     def __init__(

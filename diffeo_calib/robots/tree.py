@@ -337,9 +337,8 @@ def seen_from(
         link: the new base, by the number of the joint before it.
         joints: K joints. parents: numbers of the joints before them, -1 for the base.
 
-    Returns:
-        the joints, first those from the new base to the old one, their parents, and for every link of the old numbers
-        (-1 for the old base) the number of the last joint before it now, -1 for the new base.
+    Returns the joints, first those from the new base to the old one, their parents, and for every link of the old
+    numbers (-1 for the old base) the number of the last joint before it now, -1 for the new base.
     """
     found: list[Joint] = []
     before: list[int] = []
@@ -412,9 +411,8 @@ class Chain(Tree):
 def robot_from_config(config: Mapping[str, Any], source: str | None = None) -> Tree:
     """The inverse of :meth:`Tree.to_config`; ``source`` as in :class:`Tree`.
 
-    Raises:
-        KeyError, TypeError, ValueError: an argument is missing, or of another kind.
-        RobotError: joints that make no robot.
+    Raises KeyError, TypeError, ValueError: an argument is missing, or of another kind. RobotError: joints that make no
+    robot.
     """
     joints = [Joint.from_config(joint) for joint in config["joints"]]
     drivers = [Joint.from_config(joint) for joint in config.get("drivers", ())]

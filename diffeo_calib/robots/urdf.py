@@ -82,8 +82,7 @@ def moving_joints_below(content: bytes, links: Iterable[str]) -> list[tuple[str,
 def chains_in(path: Path) -> list[list[JointElement]]:
     """The joints of every path from the root of a URDF to a leaf.
 
-    Raises:
-        RobotError: file missing, larger than 100 MB or not a URDF, one with macros, or a link with two parents.
+    Raises RobotError: file missing, larger than 100 MB or not a URDF, one with macros, or a link with two parents.
     """
     urdf = URDF.parse(read_regular(path, "URDF", LARGEST_FILE, RobotError), path)
     urdf.check_whole("tip")
@@ -142,11 +141,7 @@ class _Paths:
 
     @classmethod
     def between(cls, urdf: URDF, base: str, tips: tuple[str, ...], loads: tuple[str, ...]) -> _Paths:
-        """Find the steps.
-
-        Raises:
-            RobotError: unknown links, links that are not connected, a link with two parents.
-        """
+        """Find the steps."""
         for role, name in (("base", base), *(("tip", tip) for tip in tips), *(("load", load) for load in loads)):
             urdf.check_link(role, name)
         both = sorted(set(tips) & set(loads))

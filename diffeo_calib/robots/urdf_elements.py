@@ -40,8 +40,7 @@ class JointElement:
 
     Args:
         name, kind, parent, child: its attributes and links; any ``kind``.
-        origin: (4, 4) pose in the parent link's frame [m].
-        axis: in its own frame, of any length.
+        origin: (4, 4) pose in the parent link's frame [m]. axis: in its own frame, of any length.
         limits: lower and upper [rad or m], infinite where the file gives none and NaN where it says NaN.
         driver: name of the joint that it mimics, empty if the file forgets it; None without <mimic>.
         multiplier, offset: of the mimic.
@@ -77,11 +76,7 @@ class URDF:
 
     @classmethod
     def parse(cls, content: bytes, path: Path) -> URDF:
-        """Read the content of a file.
-
-        Raises:
-            RobotError: not a URDF, or a joint whose description is broken.
-        """
+        """Read the content of a file. Raises RobotError: not a URDF, or a joint whose description is broken."""
         root, ignored = xml_of(content, path)
         links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
         joints = [_read_joint(element, path) for element in root.findall("joint")]

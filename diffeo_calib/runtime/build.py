@@ -28,9 +28,8 @@ MOST_TABULATED = 1500
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
     """The robot that is described as in model files (Tree.to_config).
 
-    Raises:
-        RobotError: a tip without a moving joint before it, two joints with one name, a joint that mimics a fixed joint
-            or one that is not there, or joints that mimic one another in a circle.
+    Raises RobotError: a tip without a moving joint before it, two joints with one name, a joint that mimics a fixed
+    joint or one that is not there, or joints that mimic one another in a circle.
     """
     joints, serial, drivers = robot["joints"], "tip" in robot, robot.get("drivers", ())
     parents = range(-1, len(joints) - 1) if serial else robot["parents"]
@@ -162,8 +161,7 @@ def recorded_flow(
     """The flow of a recorded geodesic.
 
     Args:
-        kernel: terms as in model files (kernels/radial.py).
-        stages: (S, 2, C, n) controls and momenta at every stage.
+        kernel: terms as in model files (kernels/radial.py). stages: (S, 2, C, n) controls and momenta at every stage.
         coefficients: (s, s), weights: (s,) of the Runge-Kutta method.
     """
     rest: list[RadialTerm] = []
@@ -238,8 +236,7 @@ def recorded_stages(
         kernel: terms as in model files. q, a: (C, n) controls and momenta at time 0.
         tableau: coefficients and weights. steps: number of equal steps.
 
-    Returns:
-        the states at every stage (S, 2, C, n), and at the end (2, C, n).
+    Returns the states at every stage (S, 2, C, n), and at the end (2, C, n).
     """
     coefficients, weights = (t / steps for t in tableau)
     state, stages = np.stack([q, a]), []

@@ -31,10 +31,8 @@ class Waves:
     """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; see robots/gear_waves.py.
 
     Args:
-        joints: (K,) numbers l.
-        selection: (K, n) units of these joints: several waves of one joint add up.
-        frequencies: (K,) w, periods per turn.
-        coefficients: (K, 2) C and S, rad or m.
+        joints: (K,) numbers l. selection: (K, n) units of these joints: several waves of one joint add up.
+        frequencies: (K,) w, periods per turn. coefficients: (K, 2) C and S, rad or m.
     """
 
     joints: tuple[int, ...]

@@ -30,8 +30,7 @@ class RadialTerm:
     F is the feature map of kernels/spaces.py: x / l on lines, (cos x, sin x) / l on circles.
 
     Args:
-        profile: name of kappa.
-        lines, circles: columns of x that it depends on, as indices.
+        profile: name of kappa. lines, circles: columns of x that it depends on, as indices.
         scales: (lines + circles,) inverse length scales, lines first.
         centre: (lines,) of the controls on the lines: differences of far points would lose digits.
         right: (S, D + 1, C): (F, 1) times it, plus |F|^2 of the lines, is the squared distance from the controls.
@@ -85,10 +84,8 @@ class RecordedFlow:
     """A flow on R^n (angles unwrapped) with the Runge-Kutta stages of its controls.
 
     Args:
-        size: n.
-        steps: number of equal steps.
-        coefficients: (s, s), weights: (s,) of the method, times the length of a step.
-        terms: sums over the controls.
+        size: n. steps: number of equal steps.
+        coefficients: (s, s), weights: (s,) of the method, times the length of a step. terms: sums over the controls.
         tables: functions of single joints, added to their own components; None without any.
     """
 

@@ -30,8 +30,7 @@ class Program:
     Args:
         joint_flow: phi^-1. chain: k0. task_flow: psi.
         markers: (P, 3) the measured markers in the frames of their tips [m].
-        on: numbers of the tips of the markers, P of them.
-        tips: names of the tips.
+        on: numbers of the tips of the markers, P of them. tips: names of the tips.
         tip: number of the tip that carries other points.
     """
 
@@ -79,8 +78,7 @@ class Program:
             q: (N, n). tool: (4, 4) in the tip's frame [m]. frame: one of :data:`FRAMES`.
             lever: distance of the points from the tool centre point [m].
 
-        Returns:
-            (N, 4, 4) [m].
+        Returns (N, 4, 4) [m].
         """
         return self._to(frame) @ nearest_poses(self.points(q, tool_points(tool, lever)))
 
@@ -133,11 +131,9 @@ def pose_slopes(points: Any, slopes: Any, R: Any, use: tuple[Any, Any, Any] = (n
 
     Args:
         points: (N, 3, 3) the three points, one per row [m]. slopes: (N, 3, 3, n) their derivatives by n parameters.
-        R: (N, 3, 3) the rotations of the poses.
-        use: an array library with its :data:`MARKS` and unit matrix.
+        R: (N, 3, 3) the rotations of the poses. use: an array library with its :data:`MARKS` and unit matrix.
 
-    Returns:
-        (N, 6, n) velocity of the origin, then angular velocity, about the axes of the points' frame.
+    Returns (N, 6, n) velocity of the origin, then angular velocity, about the axes of the points' frame.
     """
     library, marks, one = use
     centre, centred = slopes.mean(1), points - points.mean(1)[:, None]

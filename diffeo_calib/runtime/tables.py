@@ -106,8 +106,7 @@ class PeriodicSum:
     """sum_j w_j kappa(2 (1 - cos(x - q_j)) / l^2) at one stage.
 
     Args:
-        profile: name of kappa. lengthscale: l, a pure number.
-        angles: (C,) q_j, rad. weights: (C,) w_j, rad.
+        profile: name of kappa. lengthscale: l, a pure number. angles: (C,) q_j, rad. weights: (C,) w_j, rad.
     """
 
     profile: str
@@ -139,8 +138,7 @@ class Table:
     """A function on the circle, interpolated in cells.
 
     Args:
-        knots: (K + 1,) ascending from 0 to 2 pi.
-        values: (K + 1, 3) f, f', f'' there; the last row repeats the first.
+        knots: (K + 1,) ascending from 0 to 2 pi. values: (K + 1, 3) f, f', f'' there; the last row repeats the first.
     """
 
     knots: Array
@@ -161,8 +159,7 @@ class JointTables:
     """Functions of single joints at every stage.
 
     Args:
-        joints: numbers of the L joints, ascending, as an index.
-        stages: for every stage a table per joint.
+        joints: numbers of the L joints, ascending, as an index. stages: for every stage a table per joint.
         selection: (L, n) units of these joints.
         shifts: (L,) of the circles of the joints, which lie side by side on a line.
         starts: (S, power of 2) first knots of the cells of a stage on this line, ascending; of each circle's first cell
