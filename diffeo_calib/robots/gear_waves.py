@@ -58,24 +58,18 @@ class GearWaves:
 
     def columns(self, x: Tensor) -> Tensor:
         """cos(w x_l) and sin(w x_l) of every wave: (N, n) -> (N, 2 K)."""
-        angles = self._angles(x)
+        angles = x[:, list(self.joints)] * x.new_tensor(self.frequencies)
         return torch.stack([angles.cos(), angles.sin()], -1).flatten(1)
 
     def turned(self, x: Tensor, coefficients: Tensor) -> Tensor:
         """The joint values with their waves: (N, n) -> (N, n)."""
-        return self._added(x, self.columns(x) * coefficients)
+        return x + self._by_joint(x, coefficients)
 
     def slopes(self, x: Tensor, coefficients: Tensor) -> Tensor:
         """Derivative of :meth:`turned`, which is diagonal: (N, n) -> (N, n)."""
-        angles = self._angles(x)
-        w = torch.tensor(self.frequencies, dtype=x.dtype, device=x.device)
-        by_angle = torch.stack([-w * angles.sin(), w * angles.cos()], -1).flatten(1)
-        return self._added(torch.ones_like(x), by_angle * coefficients)
+        C, S = x.new_tensor(self.frequencies) * coefficients.view(-1, 2).mT
+        return 1.0 + self._by_joint(x, torch.stack([S, -C], 1).flatten())
 
-    def _angles(self, x: Tensor) -> Tensor:
-        return x[:, list(self.joints)] * torch.tensor(self.frequencies, dtype=x.dtype, device=x.device)
-
-    def _added(self, x: Tensor, terms: Tensor) -> Tensor:
-        """x plus the terms (N, 2 K) of its joints."""
-        index = torch.tensor(self.joints, dtype=torch.int64, device=x.device).repeat_interleave(2)
-        return x + terms @ torch.nn.functional.one_hot(index, x.shape[1]).to(x.dtype)
+    def _by_joint(self, x: Tensor, coefficients: Tensor) -> Tensor:
+        own = torch.nn.functional.one_hot(torch.tensor(self.joints, dtype=torch.int64, device=x.device), x.shape[1])
+        return (self.columns(x) * coefficients) @ own.to(x.dtype).repeat_interleave(2, 0)

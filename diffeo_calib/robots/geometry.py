@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -112,44 +113,37 @@ class Geometry:
 
     def poses(self, q: Tensor) -> Tensor:
         """Poses of the tip in the measuring frame, errors included: (N, n) -> (N, 4, 4), or (N, tips, 4, 4) [m]."""
-        q = self.chain.joint_values(q)
-        poses = self._walk(q, self._theta(None, q)).places[:, self.chain.tip_places]
+        poses = self._walk(q, None).places[:, self.chain.tip_places]
         return poses if len(self.chain.tips) > 1 else poses[:, 0]
 
     def marker_poses(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Poses in the measuring frame of the tips that carry the markers, see :meth:`points`: -> (N, P, 4, 4) [m]."""
-        q = self.chain.joint_values(q)
-        return self._walk(q, self._theta(theta, q)).tips
+        return self._walk(q, theta).tips
 
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Markers in the measuring frame: q (N, n), theta (K,) or per row (N, K), None for zero -> (N, P, 3) [m]."""
-        q = self.chain.joint_values(q)
-        return self._walk(q, self._theta(theta, q)).points
+        return self._walk(q, theta).points
 
     def jacobian(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Derivatives of the points by the active joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
-        q = self.chain.joint_values(q)
-        at = self._walk(q, self._theta(theta, q))
+        at = self._walk(q, theta)
         return self.chain.point_slopes(at.places[:, : self.chain.moving], at.points, self.moved)
 
     def sensitivities(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Derivatives of the points by the parameters: (N, P, 3, K) [m/m or m/rad], exact at every theta."""
-        q = self.chain.joint_values(q)
-        values = self._theta(theta, q)
-        at = self._walk(q, values)
-        N, P, L = q.shape[0], self.markers, self.chain.moving + 1
+        at = self._walk(q, theta)
+        (N, P), L, device = at.points.shape[:2], self.chain.moving + 1, at.points.device
         frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.places[:, : L - 1]], dim=1)  # base first
         R = frames[..., :3, :3]
-        w = values[..., : 6 * L].unflatten(-1, (L, 6))[..., 3:]  # (L, 3), or (N, L, 3)
         by_shift = (R @ at.twists[..., :3, :3].mT)[:, None].expand(N, P, L, 3, 3)
         arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, L, 3)
         # -[d]x a = a x d, for every column a of R' Jr; they run along dimension 3 here
-        columns = (R @ right_jacobian(w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
+        columns = (R @ right_jacobian(at.w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
         by_turn = torch.linalg.cross(columns, arms[..., None, :]).mT  # (N, P, L, 3, 3)
-        moved = torch.cat([self.moved.new_ones(P, 1), self.moved], dim=1).to(q.device)  # the base moves all markers
+        moved = torch.cat([self.moved.new_ones(P, 1), self.moved], dim=1).to(device)  # the base moves all markers
         by_twist = torch.cat([by_shift, by_turn], dim=-1) * moved[..., None, None]
         by_twist = by_twist.movedim(2, 3).reshape(N, P, 3, 6 * L)
-        own = torch.eye(P, dtype=q.dtype, device=q.device)  # the shift of a marker moves this marker only
+        own = torch.eye(P, dtype=torch.float64, device=device)  # the shift of a marker moves this marker only
         by_tool = (at.tips[:, :, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
         return torch.cat([by_twist, by_tool], dim=-1)
 
@@ -170,8 +164,9 @@ class Geometry:
         twists = theta[..., : tool.start].unflatten(-1, (-1, 6))
         return twist_transform(twists), theta[..., tool].unflatten(-1, (-1, 3))
 
-    def _walk(self, q: Tensor, theta: Tensor) -> _State:
-        chain, device = self.chain, q.device
+    def _walk(self, q: Tensor, theta: Tensor | None) -> _State:
+        chain, q = self.chain, self.chain.joint_values(q)
+        device, theta = q.device, self._theta(theta, q)
         twists, shifts = self._split(theta)
         start = self.base.to(device) @ twists[..., 0, :, :]
         count = chain.tip_places.stop
@@ -182,7 +177,8 @@ class Geometry:
         places = walk(start, torch.cat([offsets, ends]), motions, chain.before[:count])
         tips, tool = places[:, self.tip_places.to(device)], self.tool.to(device) + shifts
         points = (tips[..., :3, :3] @ tool[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return _State(twists, start, places, tips, points)
+        w = theta[..., : self.slices["tool"].start].unflatten(-1, (-1, 6))[..., 3:]
+        return _State(w, twists, start, places, tips, points)
 
     def _theta(self, theta: Tensor | None, like: Tensor) -> Tensor:
         if theta is None:
@@ -196,18 +192,12 @@ class Geometry:
         return values.to(dtype=torch.float64, device=like.device)
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """One pass along the robot.
+class _State(NamedTuple):
+    """One pass along the robot."""
 
-    Args:
-        twists: (n_all + 1, 4, 4) errors, (N, n_all + 1, 4, 4) if they differ between rows. start: (4, 4) the base.
-        places: (N, n_all + tips, 4, 4) joints' frames after their error twists, and tips.
-        tips: (N, P, 4, 4) those of the markers. points: (N, P, 3) the markers.
-    """
-
-    twists: Tensor
-    start: Tensor
-    places: Tensor
-    tips: Tensor
-    points: Tensor
+    w: Tensor  # (n_all + 1, 3) rotation vectors of the errors, (N, n_all + 1, 3) if they differ between rows
+    twists: Tensor  # (..., n_all + 1, 4, 4) transforms of the errors
+    start: Tensor  # (..., 4, 4) the base
+    places: Tensor  # (N, n_all + tips, 4, 4) joints' frames after their error twists, and tips
+    tips: Tensor  # (N, P, 4, 4) those of the markers
+    points: Tensor  # (N, P, 3) the markers

@@ -23,13 +23,8 @@ from diffeo_calib.runtime.build import ROTARY
 KINDS = (*ROTARY, "prismatic", "fixed")
 LARGEST_OFFSET = 1e6
 """No joint is farther from the one before it [m], and none is geared by more."""
-
 SQUARABLE = 1e-100
 """Smaller numbers have squares that may be 0."""
-
-
-def _z_axis() -> Tensor:
-    return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +51,7 @@ class Joint:
     name: str
     kind: str
     origin: Tensor
-    axis: Tensor = field(default_factory=_z_axis)
+    axis: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu"))
     lower: float = -inf
     upper: float = inf
     mimic: Mapping[str, float] | None = None
@@ -69,14 +64,14 @@ class Joint:
         if self.kind not in KINDS:
             raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=as_written(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
-        self._check_origin(what)
+        if (largest := float(self.origin[:3, 3].abs().max())) > LARGEST_OFFSET:
+            fix, expected = "check the unit of the lengths, which are in m", f"a place within {LARGEST_OFFSET:g} m"
+            raise RobotError.of(f"the origin of {what}", expected=expected, got=f"{largest:g} m", fix=fix)
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
-        largest = axis.abs().max()
-        if not float(largest) > 0:
+        if not float(axis.abs().max()) > 0:
             fix = "give the joint an axis, or make it fixed"
             raise RobotError.of(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix)
-        if float(largest) < SQUARABLE:
-            axis = axis / largest
+        axis = axis / axis.abs().max() if float(axis.abs().max()) < SQUARABLE else axis
         object.__setattr__(self, "axis", axis / axis.norm())
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
             got = f"lower {self.lower}, upper {self.upper}"
@@ -107,13 +102,6 @@ class Joint:
         for name, infinite in (("lower", -inf), ("upper", inf)):
             arguments[name] = infinite if arguments[name] is None else arguments[name]
         return cls(**arguments)
-
-    def _check_origin(self, what: str) -> None:
-        largest = float(self.origin[:3, 3].abs().max())
-        if largest > LARGEST_OFFSET:
-            fix = "check the unit of the lengths, which are in m"
-            expected = f"a place within {LARGEST_OFFSET:g} m of the joint before it"
-            raise RobotError.of(f"the origin of {what}", expected=expected, got=f"{largest:g} m", fix=fix)
 
     def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
         if self.kind == "fixed":

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
@@ -53,8 +54,8 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
     path = Path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     urdf = URDF.parse(content, path)
-    tips, loads = _names("tip", _only_end(urdf, "tip") if tip is None else tip), _names("load", load)
-    paths = _Paths.between(urdf, _only_end(urdf, "base") if base is None else base, tips, loads)
+    tip, base = (_only_end(urdf, role) if given is None else given for role, given in (("tip", tip), ("base", base)))
+    paths = _Paths.between(urdf, base, tip, load)
     ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
@@ -65,7 +66,7 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
 
 def read_urdf(content: bytes, base: str, tip: Names, path: Path, load: Names = ()) -> Tree:
     """As :func:`load_urdf`, from the content of a file, without warnings; ``path`` is its name in messages."""
-    paths = _Paths.between(URDF.parse(content, path), base, _names("tip", tip), _names("load", load))
+    paths = _Paths.between(URDF.parse(content, path), base, tip, load)
     return paths.robot(content.decode("utf-8", "surrogateescape"))
 
 
@@ -113,20 +114,16 @@ def _names(what: str, given: Names) -> tuple[str, ...]:
     return names
 
 
-@dataclass(frozen=True)
-class _Step:
-    """A joint on the way from the base: to its child link, or up to its parent link."""
+class _Step(NamedTuple):
+    """A joint on the way from the base, from one of its links to the other: down to its child, or up to its parent."""
 
     joint: JointElement
-    up: bool
+    start: str
+    end: str
 
     @property
-    def start(self) -> str:
-        return self.joint.child if self.up else self.joint.parent
-
-    @property
-    def end(self) -> str:
-        return self.joint.parent if self.up else self.joint.child
+    def up(self) -> bool:
+        return self.end == self.joint.parent
 
 
 @dataclass(frozen=True)
@@ -140,15 +137,14 @@ class _Paths:
     steps: list[_Step]
 
     @classmethod
-    def between(cls, urdf: URDF, base: str, tips: tuple[str, ...], loads: tuple[str, ...]) -> _Paths:
-        """Find the steps."""
+    def between(cls, urdf: URDF, base: str, tip: Names, load: Names) -> _Paths:
+        """Find the steps. Raises RobotError: unknown links, links that are not connected, a link with two parents."""
+        tips, loads = _names("tip", tip), _names("load", load)
         for role, name in (("base", base), *(("tip", tip) for tip in tips), *(("load", load) for load in loads)):
             urdf.check_link(role, name)
-        both = sorted(set(tips) & set(loads))
-        if both:
+        if both := sorted(set(tips) & set(loads)):
             raise InputError.of(f"`load` names {both}, which `tip` names too", fix="leave tips out of the loads")
-        above = _parents(urdf)
-        steps: dict[str, _Step] = {}
+        above, steps = _parents(urdf), dict[str, _Step]()
         for end in (*tips, *loads):
             for step in _way(urdf, above, base, end):
                 steps.setdefault(step.joint.name, step)
@@ -197,26 +193,26 @@ def _climb(urdf: URDF, above: dict[str, JointElement], link: str) -> list[_Step]
     """The steps from a link up to the root of the file."""
     steps: list[_Step] = []
     while link in above:
-        steps.append(_Step(above[link], up=True))
+        steps.append(_Step(above[link], link, above[link].parent))
         link = above[link].parent
         if len(steps) > len(urdf.joints):
-            passed = " <- ".join([steps[0].start, *(step.end for step in steps)][: len(urdf.joints) + 1])
-            raise RobotError.of(
-                f"joints of '{urdf.path}' make a loop", got=f"the path {passed}", fix="correct the file"
-            )
+            passed = " <- ".join([step.start for step in steps][: len(urdf.joints) + 1])
+            what, fix = f"joints of '{urdf.path}' make a loop", "correct the file"
+            raise RobotError.of(what, got=f"the path {passed}", fix=fix)
     return steps
 
 
 def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> list[_Step]:
     """The steps from the base up to the first link that is also above ``end``, and from there down to it."""
     up, down = _climb(urdf, above, base), _climb(urdf, above, end)
-    heights = {link: height for height, link in enumerate([end, *(step.end for step in down)])}
-    for number, link in enumerate([base, *(step.end for step in up)]):
-        if link in heights:
-            return [*up[:number], *(_Step(step.joint, up=False) for step in reversed(down[: heights[link]]))]
-    roots = f"'{base}' below '{up[-1].end if up else base}', '{end}' below '{down[-1].end if down else end}'"
-    what = f"links '{base}' and '{end}' are not connected in '{urdf.path}'"
-    raise RobotError.of(what, got=roots, fix="choose links of one robot")
+    reached, passed = ([link, *(step.end for step in steps)] for link, steps in ((base, up), (end, down)))
+    common = next((link for link in reached if link in passed), None)
+    if common is None:
+        roots = f"'{base}' below '{reached[-1]}', '{end}' below '{passed[-1]}'"
+        what = f"links '{base}' and '{end}' are not connected in '{urdf.path}'"
+        raise RobotError.of(what, got=roots, fix="choose links of one robot")
+    back = reversed(down[: passed.index(common)])
+    return [*up[: reached.index(common)], *(_Step(step.joint, step.end, step.start) for step in back)]
 
 
 def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
@@ -235,33 +231,28 @@ def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
 
 def _warn_of_branches(urdf: URDF, paths: _Paths) -> None:
     """Warn if joints hang on moving links before the tips and are left out: their weight bends the robot."""
-    bodies = _bodies(urdf)
-    passed = {step.joint.name for step in paths.steps}
-    carried = {bodies[step.end] for step in paths.steps} - {bodies[link] for link in (paths.base, paths.top)}
-    carried -= {bodies[link] for link in (*paths.tips, *paths.loads)}
-    hanging = [joint for joint in urdf.joints if joint.name not in passed and bodies[joint.parent] in carried]
+    above, passed = _parents(urdf), {step.joint.name for step in paths.steps}
+
+    def body(link: str) -> str:
+        """The topmost link that is fixed to a link."""
+        for _ in above:  # links may make a loop
+            if link in above and above[link].kind == "fixed":
+                link = above[link].parent
+        return link
+
+    carried = {body(step.end) for step in paths.steps}
+    carried -= {body(link) for link in (paths.base, paths.top, *paths.tips, *paths.loads)}
+    hanging = [joint for joint in urdf.joints if joint.name not in passed and body(joint.parent) in carried]
     left_out = [joint for joint in hanging if joint.kind in MOVING and joint.driver not in passed]
     if left_out:
         names = few([f"'{joint.name}'" for joint in left_out], MOST_NAMES)
-        ends = [_farthest(urdf, joint) for joint in left_out]
-        text = sentence(
+        what = (
             f"'{urdf.path}': joints that hang on links between '{paths.base}' and '{', '.join(paths.tips)}' are left "
-            f"out: {names}; where they move, their weight bends the robot in ways that its model does not know",
-            fix=f"pass load={[*paths.loads, *ends]} (on the command line --load) if the measurements have their values",
         )
-        warn_user(text)
-
-
-def _bodies(urdf: URDF) -> dict[str, str]:
-    """For every link the topmost link that is fixed to it."""
-    above = _parents(urdf)
-    bodies = {}
-    for link in [*urdf.links, *(link for joint in urdf.joints for link in (joint.parent, joint.child))]:
-        top, count = link, 0
-        while top in above and above[top].kind == "fixed" and count <= len(urdf.joints):
-            top, count = above[top].parent, count + 1
-        bodies[link] = top
-    return bodies
+        what += f"out: {names}; where they move, their weight bends the robot in ways that its model does not know"
+        loads = [*paths.loads, *(_farthest(urdf, joint) for joint in left_out)]
+        fix = f"pass load={loads} (on the command line --load) if the measurements have their values"
+        warn_user(sentence(what, fix=fix))
 
 
 def _farthest(urdf: URDF, joint: JointElement) -> str:

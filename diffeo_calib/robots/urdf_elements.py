@@ -89,9 +89,9 @@ class URDF:
             return
         self.check_whole(role, f" '{name}'")
         near = get_close_matches(name, self.links, n=3)
-        hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
-        what = f"`{role}`: '{self.path}' has no link '{name}'"
-        raise RobotError.of(what, fix=f"{hint}its links are {few(self.links, MOST_NAMES) or '(none)'}")
+        hint = f"did you mean {' or '.join(map(repr, near))}? " * bool(near)
+        links = few(self.links, MOST_NAMES) or "(none)"
+        raise RobotError.of(f"`{role}`: '{self.path}' has no link '{name}'", fix=f"{hint}its links are {links}")
 
     def check_whole(self, role: str, name: str = "") -> None:
         """Raise RobotError for macros, in a file in which no link, or none of this name, is the one for a role."""
@@ -132,12 +132,13 @@ def xml_of(content: bytes, path: Path) -> tuple[Any, list[str]]:
 def _read_joint(joint: Any, path: Path) -> JointElement:
     """Read one <joint>, wherever it is in the robot."""
     name = _attribute(joint, "name", "a <joint>", path)
-    what = f"joint '{name}'"
-    kind = _attribute(joint, "type", what, path)
-    parent, child = (_end(joint, part, what, path) for part in ("parent", "child"))
-    where = f"of {what} in '{path}'"
-    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where, finite=False)
-    (upper,) = _numbers(joint, "limit", "upper", (inf,), where, finite=False)
+    what, where = f"joint '{name}'", f"of joint '{name}' in '{path}'"
+    kind, ends = _attribute(joint, "type", what, path), []
+    for part in ("parent", "child"):
+        if (element := joint.find(part)) is None:
+            raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
+        ends.append(_attribute(element, "link", f"<{part}> of {what}", path))
+    limits = [_numbers(joint, "limit", *end, where, finite=False) for end in (("lower", (-inf,)), ("upper", (inf,)))]
     (multiplier,) = _numbers(joint, "mimic", "multiplier", (1.0,), where)
     (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
     mimic = joint.find("mimic")
@@ -146,15 +147,7 @@ def _read_joint(joint: Any, path: Path) -> JointElement:
     axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
     xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
     origin = transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
-    return JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
-
-
-def _end(joint: Any, part: str, what: str, path: Path) -> str:
-    """Name of the link at one end of a joint."""
-    element = joint.find(part)
-    if element is None:
-        raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
-    return _attribute(element, "link", f"<{part}> of {what}", path)
+    return JointElement(name, kind, *ends, origin, axis, (limits[0][0], limits[1][0]), driver, multiplier, offset)
 
 
 def _numbers(
