@@ -25,10 +25,9 @@ compliance; along the axis for a slide) and about the two axes perpendicular to 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -67,17 +66,22 @@ class GravitySag:
     @cached_property
     def joints(self) -> Tensor:
         """(K,) the moving joint of every coefficient."""
-        return _column([c.joint for c in self.compliances], torch.int64)[self._numbers]
+        return self._each("joint", torch.int64)[self._numbers]
 
     @cached_property
     def own(self) -> Tensor:
         """(K,) True for a compliance along the joint's own motion, False for a lateral one."""
-        return _column([c.own for c in self.compliances], torch.bool)[self._numbers]
+        return self._each("own", torch.bool)[self._numbers]
 
     @cached_property
     def loaded(self) -> Tensor:
         """(K,) True for the coefficients of the payload, the last ones."""
-        return _column([c.loaded for c in self.compliances], torch.bool)[self._numbers]
+        return self._each("loaded", torch.bool)[self._numbers]
+
+    @property
+    def components(self) -> Tensor:
+        """(K,) the component (0, 1, 2) of gravity, in the ground's frame, that a coefficient multiplies."""
+        return torch.arange(self.size, dtype=torch.int64, device="cpu") % 3
 
     @property
     def parts(self) -> dict[str, Tensor]:
@@ -85,11 +89,6 @@ class GravitySag:
         own, loaded = self.own, self.loaded
         found = {"gravity on joints": own & ~loaded, "gravity on links": ~own & ~loaded}
         return found | ({"payload": loaded} if self.payload is not None else {})
-
-    @cached_property
-    def components(self) -> Tensor:
-        """(K,) the component (0, 1, 2) of gravity, in the ground's frame, that a coefficient multiplies."""
-        return torch.arange(self.size, dtype=torch.int64, device="cpu") % 3
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
@@ -128,32 +127,31 @@ class GravitySag:
     def folded(self, w: Tensor) -> Tensor:
         """The coefficients (K,) of a robot that carries its payload everywhere as those of one without payload.
 
-        The payload then is one of the unknown masses at its place.
-
-        Raises InputError: a payload that differs between rows.
+        The payload then is one of the unknown masses at its place. Raises InputError: one that differs between rows.
         """
         if self.payload is None:
             return w
         if self.payload.by_row:
             raise InputError.of("a payload of every row", expected="one for all", fix="choose one: with_payload(mass)")
-        parts, amount = (
-            list(w.split([compliance.size for compliance in self.compliances])),
-            self.payload.amounts(w[None])[0],
-        )
-        unladen = [k for k, compliance in enumerate(self.compliances) if not compliance.loaded]
+        amount = self.payload.amounts(w[None])[0]
+        parts = list(w.split([compliance.size for compliance in self.compliances]))
+        unladen = [compliance for compliance in self.compliances if not compliance.loaded]
         for compliance, load in zip(self.compliances[len(unladen) :], parts[len(unladen) :], strict=True):
-            joint, direction = compliance.joint, compliance.direction
-            same = [one.joint == joint and np.array_equal(one.direction, direction) for one in self.compliances]
-            k = next(k for k in unladen if same[k])
-            own = self.compliances[k].places
+            alike = (compliance.joint, compliance.direction.tolist())
+            k = next(k for k, one in enumerate(unladen) if (one.joint, one.direction.tolist()) == alike)
+            own = unladen[k].places
             at = 3 * own.index(_representative(self.chain, compliance.places[0])) if own else 0
             parts[k] = torch.cat([parts[k][:at], parts[k][at : at + 3] + amount * load, parts[k][at + 3 :]])
         return torch.cat([w[:0], *parts[: len(unladen)]])
 
+    def _each(self, name: str, dtype: torch.dtype) -> Tensor:
+        """A property of every compliance."""
+        return torch.tensor([getattr(one, name) for one in self.compliances], dtype=dtype, device="cpu")
+
     def _amounts(self, q: Tensor) -> Tensor:
         """(N or 1, compliances) the load of each in units: the payload where that is the load, else 1."""
-        loaded = _column([c.loaded for c in self.compliances], torch.bool).to(q.device)
-        return torch.where(loaded, 1.0 if self.payload is None else self.payload.amounts(q), q.new_ones(1, 1))
+        amounts = 1.0 if self.payload is None else self.payload.amounts(q)
+        return torch.where(self._each("loaded", torch.bool).to(q.device), amounts, q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
         """All places in the ground's frame: (N, F, 4, 4)."""
@@ -176,7 +174,7 @@ class GravitySag:
     def _loads(self) -> Tensor:
         """(2, K / 3) compliance and place of every mass; the joint itself for the force along a slide."""
         pairs = [(k, place) for k, c in enumerate(self.compliances) for place in c.places or (c.joint,)]
-        return _column(pairs, torch.int64).view(-1, 2).T
+        return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2).T
 
     @cached_property
     def _numbers(self) -> Tensor:
@@ -186,20 +184,16 @@ class GravitySag:
     @cached_property
     def _constants(self) -> dict[str, Tensor]:
         """See :class:`diffeo_calib.runtime.chain.Sag`."""
-        own, joints = self.compliances, self.chain.moving
-        directions = torch.zeros(len(own), joints, 6, dtype=torch.float64, device="cpu")
-        for k, compliance in enumerate(own):
+        directions = torch.zeros(len(self.compliances), self.chain.moving, 6, dtype=torch.float64, device="cpu")
+        for k, compliance in enumerate(self.compliances):
             directions[k, compliance.joint] = torch.from_numpy(compliance.direction)
-        axes = torch.tensor([c.axis.tolist() for c in own], dtype=torch.float64, device="cpu").view(-1, 3)
-        return {
-            "joints": _column([c.joint for c in own], torch.int64),
-            "axes": axes,
-            "directions": directions.flatten(1),
-        }
+        axes = np.array([compliance.axis for compliance in self.compliances], dtype=float).reshape(-1, 3)
+        joints = self._each("joint", torch.int64)
+        return {"joints": joints, "axes": torch.from_numpy(axes), "directions": directions.flatten(1)}
 
 
 class _Sag(NamedTuple):
-    """The part of :class:`diffeo_calib.runtime.chain.Sag` that its equations need; compilers follow named tuples."""
+    """That of :class:`diffeo_calib.runtime.chain.Sag`; compilers follow named tuples."""
 
     moments: Tensor
     forces: Tensor
@@ -209,16 +203,12 @@ class _Sag(NamedTuple):
 
 
 class _Robot(NamedTuple):
-    """That of :class:`diffeo_calib.runtime.chain.NominalChain`."""
+    """Some of :class:`diffeo_calib.runtime.chain.NominalChain`."""
 
     axes: Tensor
     revolute: Tensor
     moved: Tensor
     signs: Tensor
-
-
-def _column(values: Sequence[Any], dtype: torch.dtype) -> Tensor:
-    return torch.tensor(values, dtype=dtype, device="cpu")
 
 
 def _under_payload(chain: Tree, link: str) -> list[Compliance]:

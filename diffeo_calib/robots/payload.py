@@ -26,9 +26,7 @@ class Payload:
     Args:
         link: name of the tip, or of the branch without markers (`load`), at whose origin the mass sits.
         masses: of the robot everywhere (), or of N rows (N,), in any unit.
-        unit: the mass, in the same unit, that counts as one: coefficients are sags under it.
-
-    Raises InputError: a unit that is not positive.
+        unit: the mass, in the same unit, that counts as one: coefficients are sags under it. Positive.
     """
 
     link: str
@@ -46,8 +44,8 @@ class Payload:
         Args:
             robot: n joints. masses: in any unit. at: name of the link that carried them; by default the only tip.
 
-        Raises MeasurementError: no mass at all, or a robot with several tips and no link named. InputError: a link that
-        is no tip and no load of the robot. Warns DiffeoCalibWarning: the payload never changes.
+        Raises MeasurementError: no mass at all, or several tips and no link named. InputError: a link that is no tip
+        and no load of the robot. Warns DiffeoCalibWarning: the payload never changes.
         """
         if masses is None:
             return None
@@ -62,8 +60,7 @@ class Payload:
             raise InputError.of("the link of the payload", expected=listed(list(robot.ends)), got=link, fix=fix)
         if bool((masses == largest).all()):
             what = f"all rows carry the same payload ({largest:g}): its sag cannot be told from that under the robot's"
-            fix = "measure with different payloads if the robot will carry others"
-            warn_user(sentence(f"{what} weight", fix=fix))
+            warn_user(sentence(f"{what} weight", fix="measure with different payloads if the robot will carry others"))
         return cls(link, masses, largest)
 
     @property
@@ -72,10 +69,7 @@ class Payload:
         return self.masses.ndim > 0
 
     def amounts(self, q: Tensor) -> Tensor:
-        """The masses in units, one for each configuration (N, n) or one for all: (N, 1) or (1, 1).
-
-        Raises InputError: masses of another number of rows.
-        """
+        """The masses in units, one for each configuration (N, n) or one for all: (N, 1) or (1, 1)."""
         if self.by_row and len(self.masses) != len(q):
             got, fix = f"{len(q)} configurations", "pass one mass for all configurations"
             raise InputError.of(f"payloads of {len(self.masses)} rows", expected="one for each", got=got, fix=fix)
@@ -108,10 +102,7 @@ class Payload:
         return self.weighing(masses)
 
     def checked(self) -> Payload:
-        """The same payload, if its masses can be meant.
-
-        Raises InputError: masses far above those of the fit. Warns DiffeoCalibWarning: masses above those of the fit.
-        """
+        """The same payload; InputError for masses far above those of the fit, a warning for masses above them."""
         largest = float(self.masses.max()) if self.masses.numel() else 0.0
         got, measured = f"{largest:g}", f"0 to {self.unit:g} in the measurements of the fit"
         if largest > ABSURD * self.unit:
@@ -129,7 +120,7 @@ class Payload:
 class NoPayload(Payload):
     """In place of a :class:`Payload` where none is known; false."""
 
-    by_row, mass = False, None  # pyright: ignore[reportAssignmentType]
+    by_row, mass, typical = False, None, property(lambda self: self)  # pyright: ignore[reportAssignmentType]
 
     def __init__(self) -> None:
         super().__init__("", torch.zeros(0, dtype=torch.float64, device=HOST), 1.0)
@@ -148,18 +139,8 @@ class NoPayload(Payload):
 
     def under(self, masses: Tensor | None) -> NoPayload:
         """None; MeasurementError for rows with payloads."""
-        if masses is not None:
-            fix = "calibrate with payloads too, or leave them out"
-            raise MeasurementError.of("the measurements have payloads, the model was calibrated without", fix=fix)
-        return self
-
-    @property
-    def typical(self) -> NoPayload:
-        """None."""
-        return self
-
-    def checked(self) -> NoPayload:
-        """None."""
+        fix = "calibrate with payloads too, or leave them out"
+        check_unladen(masses, "the measurements have payloads, the model was calibrated without", fix=fix)
         return self
 
     def check_elastic(self) -> None:
