@@ -38,7 +38,7 @@ from queries import configurations, models
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop import CFiles, write_c
-from diffeo_calib.interop.c_constants import array
+from diffeo_calib.interop.c_source import array
 from diffeo_calib.kinematics.program import program_of
 
 ROWS, RUNS, QUICK_RUNS = 20, 500, 3

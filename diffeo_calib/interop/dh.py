@@ -138,14 +138,13 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
         xyz, rpy = origin_numbers(transform)
         return [name, "fixed", *[""] * 5, *in_unit(xyz, length), *in_unit(rpy, angle), *[""] * (2 * mimics)]
 
-    def joint(name: str, row: DHRow) -> list[object]:
+    rows = [fixed("base", table.base)]
+    for name, row in zip(table.names, table.rows, strict=True):
         (a, d), (alpha, theta, beta) = in_unit((row.a, row.d), length), in_unit((row.alpha, row.theta, row.beta), angle)
         driven = " + ".join(f"{slope!r} {by}" for by, slope in (row.mimic or {}).items())
         follows = [driven, row.mimic_offset if driven else ""] if mimics else []
-        return [name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows]
-
-    joints = [joint(name, row) for name, row in zip(table.names, table.rows, strict=True)]
-    return table_text(header, [fixed("base", table.base), *joints, fixed("tool", table.tool)])
+        rows.append([name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows])
+    return table_text(header, [*rows, fixed("tool", table.tool)])
 
 
 def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], list[Tensor], Tensor]:

@@ -61,27 +61,24 @@ def mjcf_text(geometry: Geometry) -> str:
     etree.SubElement(root, "compiler", angle="radian", autolimits="true", **limits)
     world = etree.SubElement(root, "worldbody")
     bodies: dict[int, Any] = {BASE: etree.SubElement(world, "body", name=chain.base)}
-    errors, links = iter(geometry.joint_errors), _Links(chain)
+    errors, links = iter(geometry.joint_errors), _links(chain)
     for number, (joint, parent) in enumerate(zip(chain.joints, chain.parents, strict=True)):
-        placed = _placed(joint.origin if joint.kind == "fixed" else joint.origin @ next(errors))
-        bodies[number] = body = etree.SubElement(bodies[parent], "body", name=links.name(joint.name), **placed)
-        if (inertial := links.inertial(joint.name)) is not None:
-            etree.SubElement(body, "inertial", **inertial)
+        link, inertial = links.get(joint.name, (joint.name, None))
+        placed = joint.origin if joint.kind == "fixed" else joint.origin @ next(errors)
+        turn = rotation_numbers(placed[None, :3, :3], "quat_wxyz", angle="rad")[0]
+        place = {"pos": _text(placed[:3, 3]), "quat": _text(turn)}
+        bodies[number] = body = etree.SubElement(bodies[parent], "body", name=link, **place)
+        if inertial is not None and (found := _inertial(link, inertial)):
+            etree.SubElement(body, "inertial", **found)
         if joint.kind != "fixed":
             etree.SubElement(body, "joint", name=joint.name, **_motion(joint))
     for tip in chain.tips:
         etree.SubElement(bodies[chain.ends[tip]], "site", name=tip)
-    mimics = [joint for joint in chain.joints if joint.mimic is not None]
-    if mimics:
+    if mimics := [joint for joint in chain.joints if joint.mimic is not None]:
         together = etree.SubElement(root, "equality")
         for joint in mimics:
             etree.SubElement(together, "joint", **_following(joint, chain))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
-
-
-def _placed(transform: Tensor) -> dict[str, str]:
-    quaternion = rotation_numbers(transform[None, :3, :3], "quat_wxyz", angle="rad")[0]
-    return {"pos": _text(transform[:3, 3]), "quat": _text(quaternion)}
 
 
 def _motion(joint: Joint) -> dict[str, str]:
@@ -102,47 +99,32 @@ def _following(joint: Joint, chain: Tree) -> dict[str, str]:
     return {"joint1": joint.name, "joint2": driver, "polycoef": f"{joint.mimic_offset!r} {factor!r} 0 0 0"}
 
 
-class _Links:
-    """Names and inertias of the links below each joint, from the robot's URDF; empty without one."""
-
-    def __init__(self, chain: Tree) -> None:
-        self._names: dict[str, str] = {}
-        self._inertials: dict[str, Any] = {}
-        if chain.source is not None:
-            root = xml_of(chain.source.encode("utf-8", "surrogateescape"), Path("the URDF"))[0]
-            children = ((joint.get("name"), joint.find("child")) for joint in root.findall("joint"))
-            self._names = {name: child.get("link") for name, child in children if child is not None}
-            self._inertials = {link.get("name"): link.find("inertial") for link in root.findall("link")}
-
-    def name(self, joint: str) -> str:
-        """Of the link, or of the joint where the link is not known."""
-        return self._names.get(joint, joint)
-
-    def inertial(self, joint: str) -> dict[str, str] | None:
-        """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; None where the URDF has none."""
-        element = self._inertials.get(self.name(joint))
-        if element is None:
-            return None
-        mass, inertia = element.find("mass"), element.find("inertia")
-        if mass is None or inertia is None:
-            return None
-        try:
-            names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-            kilograms = float(mass.get("value", ""))
-            ixx, iyy, izz, ixy, ixz, iyz = (float(inertia.get(name, "0")) for name in names)
-            xyz, R = _place(element.find("origin"))
-        except (TypeError, ValueError) as error:
-            what = f"<inertial> of link '{self.name(joint)}' in the URDF"
-            raise RobotError.of(what, expected="numbers", got=str(error), fix="correct the file") from None
-        turned = R @ R.new_tensor([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.mT
-        moments = turned[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        return {"mass": repr(kilograms), "pos": xyz, "fullinertia": _text(moments)}
+def _links(chain: Tree) -> dict[str, tuple[str, Any]]:
+    """Joint -> name of the link below it and its <inertial>, from the robot's URDF; empty without one."""
+    if chain.source is None:
+        return {}
+    root = xml_of(chain.source.encode("utf-8", "surrogateescape"), Path("the URDF"))[0]
+    inertials = {link.get("name"): link.find("inertial") for link in root.findall("link")}
+    children = {joint.get("name"): joint.find("child") for joint in root.findall("joint")}
+    links = {joint: child.get("link") for joint, child in children.items() if child is not None}
+    return {joint: (link, inertials.get(link)) for joint, link in links.items()}
 
 
-def _place(origin: Any) -> tuple[str, Tensor]:
-    """The xyz of an <origin> as text, and its rotation (3, 3)."""
+def _inertial(link: str, element: Any) -> dict[str, str]:
+    """Mass [kg], centre [m] and inertia [kg m^2] in the link's axes; nothing where the URDF lacks one of them."""
+    mass, inertia, origin = (element.find(part) for part in ("mass", "inertia", "origin"))
+    if mass is None or inertia is None:
+        return {}
     xyz, rpy = ("0 0 0" if origin is None else origin.get(name, "0 0 0") for name in ("xyz", "rpy"))
-    return xyz, roll_pitch_yaw(*map(float, rpy.split()))
+    try:
+        kilograms, R = float(mass.get("value", "")), roll_pitch_yaw(*map(float, rpy.split()))
+        names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
+        tensor = R.new_tensor([float(inertia.get(name, "0")) for name in names]).view(3, 3)
+    except (TypeError, ValueError) as error:
+        what = f"<inertial> of link '{link}' in the URDF"
+        raise RobotError.of(what, expected="numbers", got=str(error), fix="correct the file") from None
+    moments = (R @ tensor @ R.mT)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return {"mass": repr(kilograms), "pos": xyz, "fullinertia": _text(moments)}
 
 
 def _text(numbers: Tensor) -> str:

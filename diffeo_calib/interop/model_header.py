@@ -2,10 +2,9 @@
 
 The header holds the format version, units, robot, kernels, time stepping and a summary of the fit.
 
-What only some models have in their files: payloads, a registration, sessions; entries of the header, and tensors.
-
-Readers that know nothing of them must refuse such a file: controls of other payloads or sessions have other markers,
-and the markers of the fit are not those of a registered model.
+Only some models have payloads, a registration or sessions. Readers that know nothing of them must refuse such a file:
+controls of other payloads or sessions have other markers, and the markers of the fit are not those of a registered
+model.
 """
 
 from __future__ import annotations
@@ -64,6 +63,22 @@ ROBOT_TENSORS = ("rigid_errors", "scales")
 
 Tensors = dict[str, Tensor]
 KernelClasses = Mapping[str, type[Kernel] | type[Profile] | Profile]
+PAYLOADS = ("payloads", "task_controls", "unladen_theta")
+"""Tensors of a model with payloads: mass of every control; then, for readers without the formulas of a payload, the
+places of the controls' markers before the task-space flow, and theta of a robot for which the payload of the model is
+a part of its own weight."""
+SHARED = "shared_noise"
+SESSIONS = (SHARED, "session", "session_tools")
+"""Effects of shifts that rows share, number of each control's session, markers of each. The last two are missing where
+one calibration had several sessions, whose markers are those of the model."""
+PREFIX = "registration_"
+ARRAYS = ("transform", "markers", "covariance", "centre", "q", "gain", "noise")
+REGISTRATION = tuple(PREFIX + name for name in ARRAYS)
+NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
+UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
+ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", "shift")
+LEARNT, TABLE = "learnt", "table_sha256"
+"""Entries of a registration that the map learnt from, no map around another one; the first files had no table."""
 PROBE_TOLERANCE = 1e-9
 """Largest relative difference between values of a profile passed to `load` and of that of the fit."""
 
@@ -86,18 +101,13 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
         raise InputError.of("`model`", expected="an exact model", got=got, fix=fix)
     spec, deformation = inner.deformation.spec, inner.deformation
-    nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
-    momenta = deformation.momenta
-    values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
-    tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
-    known = {name: getattr(inner, attribute) for name, attribute in MAP_TENSORS.items()}
-    header: Header = {"report": {}, "lever": None}
-    if isinstance(model, CalibratedKinematics):
-        known |= {name: getattr(model, name) for name in ROBOT_TENSORS}
-        header = _of_robot(model)
-    tensors |= {name: tensor for name, tensor in known.items() if tensor is not None}
-    tensors |= describe_sessions(inner) | payload_tensors(inner)
-    header |= {
+    nominal, tensors = _describe_nominal(spec.nominal, deformation.x)
+    values = (deformation.x, *deformation.momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
+    tensors |= dict(zip(MOMENTA, values, strict=True)) | _tensors_of_rows(inner)
+    tensors |= {name: getattr(inner, attribute) for name, attribute in MAP_TENSORS.items()}
+    header: Header = {
+        "report": {},
+        "lever": None,
         "format": FORMAT,
         "units": UNITS,
         "nominal": nominal,
@@ -106,26 +116,25 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "task_dim": spec.task_dim,
         "integrator": deformation.integrator.to_config(),
     }
-    found = model.registration
-    if found is not None:
-        header["registration"], arrays = describe_registration(found)
-        header["registration"] |= {LEARNT: True} if seen.registration is None else {}
-        tensors |= arrays
-    return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-
-
-def _of_robot(model: CalibratedKinematics) -> Header:
-    """Entries of a robot's model, of which some have not all."""
-    known = {
-        "tool": model.tool.tolist() if model.has_tool else None,
-        "tool_tip": model.tool_tip,
-        "urdf": model.robot.source,
-        "provenance": None if model.provenance is None else model.provenance.to_dict(),
-        "ball": True if model.ball and model.map.workspace is None else None,
-        "placement": [own.entry() for own in model.placement] or None,
-    }
-    found = {name: entry for name, entry in known.items() if entry is not None}
-    return found | {"report": model.report, "lever": model.lever}
+    if isinstance(model, CalibratedKinematics):
+        tensors |= {name: getattr(model, name) for name in ROBOT_TENSORS}
+        known = {
+            "tool": model.tool.tolist() if model.has_tool else None,
+            "tool_tip": model.tool_tip,
+            "urdf": model.robot.source,
+            "provenance": None if model.provenance is None else model.provenance.to_dict(),
+            "ball": True if model.ball and model.map.workspace is None else None,
+            "placement": [own.entry() for own in model.placement] or None,
+        }
+        header |= {name: entry for name, entry in known.items() if entry is not None}
+        header |= {"report": model.report, "lever": model.lever}
+    if (found := model.registration) is not None:
+        entry = {name: getattr(found, name) for name in ENTRIES}
+        entry["shift"] = None if found.shift is None else found.shift.tolist()
+        entry |= {TABLE: found.table_sha256} if found.table_sha256 else {}
+        header["registration"] = entry | ({LEARNT: True} if seen.registration is None else {})
+        tensors |= {PREFIX + name: getattr(found, name) for name in ARRAYS}
+    return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items() if t is not None}
 
 
 def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
@@ -156,6 +165,25 @@ def _describe_kernel(kernel: Kernel) -> list[Header]:
     ]
 
 
+def _tensors_of_rows(fitted: FittedMap) -> Tensors:
+    """The tensors of sessions and payloads; none where all rows are of one session, and nothing is carried."""
+    spec, theta, found = fitted.geodesic.spec, fitted.geodesic.momenta.theta, Tensors()
+    nominal, by_row, shared = spec.nominal, spec.nominal_of_controls, fitted.noise.shared
+    if isinstance(spec.at_controls, SessionMarkers):
+        sessions = spec.at_controls
+        found |= zip(SESSIONS, (shared, sessions.session.to(torch.float64), sessions.tools), strict=True)
+    elif shared.shape[2]:
+        found[SHARED] = shared
+    if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.payload is not None:
+        rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
+        if not rows.by_row:
+            raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
+        sag = nominal.sag
+        folded = torch.cat([theta[: sag.start], nominal.elasticity.folded(theta[sag]), theta[sag.stop :]])
+        found |= zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, folded), strict=True)
+    return found
+
+
 def rebuild(
     header: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None, kernels: KernelClasses
 ) -> CalibratedKinematics | FittedMap:
@@ -173,94 +201,72 @@ def rebuild(
         what = "the header of the model file is not understood"
         raise ModelFileError.of(what, expected=sorted(known), got=sorted(header))
     x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
-    nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal, header.get("urdf"))
-    _check_sizes(header, tensors, nominal_map)
-    spec = ModelSpec(
-        nominal_map,
-        _rebuild_kernel(header["joint_kernel"], kernels),
-        _rebuild_kernel(header["task_kernel"], kernels),
-        prior,
-        header["task_dim"],
-    )
-    spec.joint_kernel.check(x.shape[1], "joint_kernel")
-    spec.task_kernel.check(spec.task_dim, "task_kernel")
-    integrator = integrator_from_config(header["integrator"])
-    by_row = rows_with_payloads(nominal_map, tensors)
-    by_row = rebuild_sessions(by_row or nominal_map, tensors) or by_row
-    spec = replace(spec, at_controls=by_row)
-    deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
-    known = {attribute: tensors.get(name) for name, attribute in MAP_TENSORS.items()}
-    fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), new_noise=new_noise, **known)
+    k0 = _rebuild_nominal(header["nominal"], tensors, nominal, header.get("urdf"))
+    _check(header, tensors, k0)
+    joint, task = (_rebuild_kernel(header[name], kernels) for name in ("joint_kernel", "task_kernel"))
+    spec = ModelSpec(k0, joint, task, prior, header["task_dim"])
+    joint.check(x.shape[1], "joint_kernel")
+    task.check(spec.task_dim, "task_kernel")
+    spec = replace(spec, at_controls=_rebuild_rows(k0, tensors))
+    deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator_from_config(header["integrator"]))
+    of_map = {attribute: tensors.get(name) for name, attribute in MAP_TENSORS.items()}
+    fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), new_noise=new_noise, **of_map)
     learnt = None
     if "registration" in header:
         found = rebuild_registration(header["registration"], tensors, x.shape[1])
         learnt = found if LEARNT in header["registration"] else None
         fitted = fitted if learnt else RegisteredMap(fitted, found)
-    if isinstance(spec.nominal, GeometryMap):
-        summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
-        given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
-        given |= {name: tensors.get(name) for name in ROBOT_TENSORS}
-        given["learnt"] = learnt
-        given["ball"] = header.get("ball", False) is True
-        given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
-        given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
-        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, summary, **given)
-    if header["lever"] is not None:
-        raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
-    return fitted
+    if not isinstance(k0, GeometryMap):
+        if header["lever"] is not None:
+            raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
+        return fitted
+    summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
+    given = {name: header.get(name) for name in ("lever", "tool", "tool_tip")}
+    given |= {name: tensors.get(name) for name in ROBOT_TENSORS} | {"learnt": learnt}
+    given["ball"] = header.get("ball", False) is True
+    given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
+    given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
+    return CalibratedKinematics(k0.geometry.chain, fitted, summary, **given)
 
 
-def _check_names(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
-    """Raise InputError unless all tensors that belong to the header are there, and no other ones."""
-    expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
-    if "registration" in header:
-        expected |= set(REGISTRATION)
+def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
+    """Raise InputError unless all tensors that belong to the header are there, finite float64 of shapes that agree."""
+    robot = nominal if isinstance(nominal, GeometryMap) else None
+    expected = {*MOMENTA, *(("probe",) if robot is None else GEOMETRY)}
+    expected |= set(REGISTRATION) if "registration" in header else set()
+    expected |= set(PAYLOADS) if robot is not None and robot.payload is not None else set()
     if SHARED in tensors:
-        expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
-    if isinstance(nominal, GeometryMap) and nominal.payload is not None:
-        expected |= set(PAYLOADS)
-    robot = isinstance(nominal, GeometryMap)
-    optional = {*MAP_TENSORS, *ROBOT_TENSORS} if robot else set(MAP_TENSORS) - {"workspace"}
+        expected |= set(SESSIONS) if SESSIONS[1] in tensors else {SHARED}
+    optional = set(MAP_TENSORS) - {"workspace"} if robot is None else {*MAP_TENSORS, *ROBOT_TENSORS}
     if set(tensors) - optional != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
-
-
-def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
-    """Raise InputError unless all tensors are finite float64 and their shapes agree."""
-    _check_names(header, tensors, nominal)
-    for name, tensor in tensors.items():
-        if tensor.dtype != torch.float64:
-            raise InputError.of(f"the tensor {name}", expected="float64", got=tensor.dtype)
+    if other := {name: tensor.dtype for name, tensor in tensors.items() if tensor.dtype != torch.float64}:
+        raise InputError.of(f"the tensors {', '.join(other)}", expected="float64", got=next(iter(other.values())))
     (n_rows, n), (_, seen, _) = tensors["x"].shape, tensors["noise"].shape
     m = tensors["new_noise"].shape[0] if "slopes" in tensors else seen
-    dim, size = header["task_dim"], nominal.parameters
-    if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
+    dim, size, data = header["task_dim"], nominal.parameters, len(tensors.get("data", tensors["x"]))
+    if type(dim) is not int or dim < 1 or m % dim or (robot is not None and dim != 3):
         raise InputError.of("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim)
     if not isinstance(header["report"], dict):
         raise InputError.of("the entry report", expected="a table", got=type(header["report"]).__name__)
-    if isinstance(nominal, GeometryMap) and n != nominal.geometry.chain.n:
-        raise InputError.of("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n)
-    data = len(tensors.get("data", tensors["x"]))
+    if robot is not None and n != robot.geometry.chain.n:
+        raise InputError.of("the tensor x", expected=f"{robot.geometry.chain.n} active joints", got=n)
     shapes = {
-        "x": (n_rows, n),
-        "momenta_x": (n_rows, n),
-        "momenta_y": (n_rows * m // dim, dim),
-        "theta": (size,),
-        "noise": (data, seen, seen),
-        "prior_variance": (size,),
-        "new_noise": (m, m),
+        **{"x": (n_rows, n), "momenta_x": (n_rows, n), "momenta_y": (n_rows * m // dim, dim)},
+        **{"theta": (size,), "prior_variance": (size,), "noise": (data, seen, seen), "new_noise": (m, m)},
+        **{"data": (data, n), "workspace": ("M", n), "slopes": (data, seen, m), "measured": (data, seen)},
+        **{"session": (n_rows,), "payloads": (n_rows,), SHARED: (data, seen, "c")},
     }
-    own = {"data": (data, n), "workspace": ("M", n), "slopes": (data, seen, m), "measured": (data, seen)}
-    if isinstance(nominal, GeometryMap):
-        own["scales"] = (5 * n + 2 * nominal.geometry.chain.moving + 9,)
-    shapes |= {name: shape for name, shape in own.items() if name in tensors}
+    if robot is not None:
+        shapes["scales"] = (5 * n + 2 * robot.geometry.chain.moving + 9,)
+        shapes["session_tools"] = ("S", robot.geometry.markers, 3)
     for name, shape in shapes.items():
-        as_tensor(tensors[name], name, shape, empty=size == 0)
+        if name in tensors:
+            as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
-    if isinstance(nominal, GeometryMap) and size and float(tensors["theta"].abs().max()) > LARGEST_PARAMETER:
-        got = f"{float(tensors['theta'].abs().max()):.3g}"
-        raise InputError.of("the tensor theta", expected=f"at most {LARGEST_PARAMETER:g}", got=got)
+    if robot is not None and size and (largest := float(tensors["theta"].abs().max())) > LARGEST_PARAMETER:
+        raise InputError.of("the tensor theta", expected=f"at most {LARGEST_PARAMETER:g}", got=f"{largest:.3g}")
     if "scales" in tensors and bool((tensors["scales"] < 0).any()):
         raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors["scales"].min()))
     check_covariance(tensors["new_noise"], "the tensor new_noise")
@@ -288,7 +294,13 @@ def _rebuild_nominal(
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
-    waves, payload = GearWaves.from_config(description.get("waves", ())), rebuild_payload(description.get("payload"))
+    payload = None
+    if (carried := description.get("payload")) is not None:
+        mass, unit = (float(carried[name]) for name in ("mass", "unit"))
+        if not 0 <= mass < inf or not isinstance(carried["link"], str):
+            raise InputError.of("the entry payload", expected="a link and a mass of 0 or more", got=dict(carried))
+        payload = Payload(carried["link"], torch.tensor(mass, dtype=torch.float64, device=HOST), unit)
+    waves = GearWaves.from_config(description.get("waves", ()))
     return GeometryMap(geometry, elastic=description["elastic"], waves=waves, payload=payload)
 
 
@@ -308,10 +320,9 @@ def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
 
 
 def _missing(what: str, fix: str, classes: KernelClasses) -> MissingArgumentError:
+    what = f"the model uses the {what}, which is not part of diffeo_calib"
     got = f"`kernels` with {few(list(classes)) or 'no entry'}"
-    return MissingArgumentError.of(
-        f"the model uses the {what}, which is not part of diffeo_calib", got=got, fix=f"pass {fix}"
-    )
+    return MissingArgumentError.of(what, got=got, fix=f"pass {fix}")
 
 
 def _own_profile(name: str, values: list[float] | None, classes: KernelClasses) -> Profile:
@@ -326,81 +337,32 @@ def _own_profile(name: str, values: list[float] | None, classes: KernelClasses) 
         return profile
     own = torch.tensor([probe(profile), values], dtype=torch.float64, device=HOST)
     if not torch.allclose(own[0], own[1], rtol=PROBE_TOLERANCE, atol=0.0):
-        shown = [", ".join(f"{kappa:.6g}" for kappa in row) for row in own.tolist()]
-        raise MissingArgumentError.of(
-            f"the profile {name!r} passed in `kernels` is not that of the model",
-            expected=f"kappa = {shown[1]} at r2 = {', '.join(map(str, PROBED_R2))}",
-            got=shown[0],
-            fix="pass the profile of the fit, with the same parameters",
-        )
+        got, wanted = (", ".join(f"{kappa:.6g}" for kappa in row) for row in own.tolist())
+        what = f"the profile {name!r} passed in `kernels` is not that of the model"
+        expected = f"kappa = {wanted} at r2 = {', '.join(map(str, PROBED_R2))}"
+        fix = "pass the profile of the fit, with the same parameters"
+        raise MissingArgumentError.of(what, expected=expected, got=got, fix=fix)
     return profile
 
 
-PAYLOADS = ("payloads", "task_controls", "unladen_theta")
-"""Names of the tensors: mass of every control; then, for readers without the formulas of a payload, the places of the
-controls' markers before the task-space flow, and theta of a robot for which the payload of the model is a part of its
-own weight."""
-
-
-def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
-    """The tensors of a map; none without payloads."""
-    spec, theta = fitted.geodesic.spec, fitted.geodesic.momenta.theta
-    nominal, by_row = spec.nominal, spec.nominal_of_controls
-    if not isinstance(nominal, GeometryMap) or nominal.elasticity is None or nominal.payload is None:
-        return {}
-    rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
-    if not rows.by_row:
-        raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
-    sag = nominal.sag
-    folded = torch.cat([theta[: sag.start], nominal.elasticity.folded(theta[sag]), theta[sag.stop :]])
-    return dict(zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, folded), strict=True))
-
-
-def rebuild_payload(entry: Mapping[str, Any] | None) -> Payload | None:
-    """The payload that a robot carries in all queries, by its entry. Raises InputError: numbers that are no masses."""
-    if entry is None:
+def _rebuild_rows(nominal: NominalMap, tensors: Tensors) -> GeometryMap | SessionMarkers | None:
+    """k0 at the controls, each with its own payload and of its own session; None where these are the same for all."""
+    if SHARED in tensors and not isinstance(nominal, GeometryMap):
+        raise InputError.of("sessions of rows", expected="a robot", got="a plain function")
+    if not isinstance(nominal, GeometryMap):
         return None
-    mass, unit = (float(entry[name]) for name in ("mass", "unit"))
-    if not 0 <= mass < float("inf") or not isinstance(entry["link"], str):
-        raise InputError.of("the entry payload", expected="a link and a mass of 0 or more", got=dict(entry))
-    return Payload(entry["link"], torch.tensor(mass, dtype=torch.float64, device=HOST), unit)
+    laden = nominal.payload
+    by_row = None if laden is None else nominal.with_payload(laden.weighing(tensors[PAYLOADS[0]]))
+    if SESSIONS[1] not in tensors:
+        return by_row
+    whole = tensors["session"].round().to(torch.int64)
+    if bool((whole != tensors["session"]).any()):
+        raise InputError.of("the tensor session", expected="whole numbers", got=tensors["session"][:5].tolist())
+    return SessionMarkers(by_row or nominal, whole, tensors["session_tools"])
 
 
-def rows_with_payloads(nominal: NominalMap, tensors: Mapping[str, Tensor]) -> GeometryMap | None:
-    """k0 at the controls, each with its own payload; None without payloads.
-
-    Raises InputError: not one mass for each control.
-    """
-    if not isinstance(nominal, GeometryMap) or nominal.payload is None:
-        return None
-    masses = as_tensor(tensors[PAYLOADS[0]], PAYLOADS[0], (len(tensors["x"]),))
-    return nominal.with_payload(nominal.payload.weighing(masses))
-
-
-PREFIX = "registration_"
-ARRAYS = ("transform", "markers", "covariance", "centre", "q", "gain", "noise")
-REGISTRATION = tuple(PREFIX + name for name in ARRAYS)
-"""Names of the tensors."""
-NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
-UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
-ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", "shift")
-LEARNT, TABLE = "learnt", "table_sha256"
-"""Entries of a registration that the map learnt from, no map around another one; the first files had no table."""
-
-
-def describe_registration(found: Registration) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Its entry in the header, and its tensors."""
-    entry = {name: getattr(found, name) for name in ENTRIES}
-    entry["shift"] = None if found.shift is None else found.shift.tolist()
-    entry |= {TABLE: found.table_sha256} if found.table_sha256 else {}
-    return entry, {PREFIX + name: getattr(found, name) for name in ARRAYS}
-
-
-def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Registration:
-    """The inverse of :func:`describe_registration`; ``n`` is the number of joints.
-
-    Raises InputError: entries that are missing or do not fit together.
-    """
+def rebuild_registration(entry: Any, tensors: Tensors, n: int) -> Registration:
+    """A registration of a robot with n joints."""
     if not isinstance(entry, dict) or set(entry) - {LEARNT, TABLE} != set(ENTRIES):
         got = sorted(entry) if isinstance(entry, dict) else entry
         raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
@@ -420,39 +382,3 @@ def rebuild_registration(entry: Any, tensors: dict[str, Tensor], n: int) -> Regi
     words = {"outliers": tuple(map(int, entry["outliers"])), "undetermined": tuple(map(str, entry["undetermined"]))}
     named = {name: entry[name] for name in (*NUMBERS, "same", "free")} | {TABLE: str(entry.get(TABLE, ""))}
     return Registration(**arrays, **words, **named, shift=shift)
-
-
-SHARED = "shared_noise"
-SESSIONS = (SHARED, "session", "session_tools")
-"""Names of the tensors: effects of shifts that rows share, number of each control's session, markers of each. The last
-two are missing where one calibration had several sessions, whose markers are those of the model."""
-
-
-def describe_sessions(fitted: FittedMap) -> dict[str, Tensor]:
-    """The tensors of a map; none if all its rows are of one session."""
-    by_row = fitted.geodesic.spec.at_controls
-    if not isinstance(by_row, SessionMarkers):
-        return {SHARED: fitted.noise.shared} if fitted.noise.shared.shape[2] else {}
-    values = fitted.noise.shared, by_row.session.to(torch.float64), by_row.tools
-    return dict(zip(SESSIONS, values, strict=True))
-
-
-def rebuild_sessions(nominal: NominalMap, tensors: dict[str, Tensor]) -> SessionMarkers | None:
-    """The inverse of :func:`describe_sessions`: k0 at the controls.
-
-    Raises InputError: tensors that do not fit together.
-    """
-    if SHARED not in tensors:
-        return None
-    if not isinstance(nominal, GeometryMap):
-        raise InputError.of("sessions of rows", expected="a robot", got="a plain function")
-    noise, rows = tensors["noise"], len(tensors["x"])
-    as_tensor(tensors[SHARED], SHARED, (len(noise), noise.shape[1], "c"))
-    if SESSIONS[1] not in tensors:
-        return None
-    numbers = as_tensor(tensors["session"], "session", (rows,))
-    tools = as_tensor(tensors["session_tools"], "session_tools", ("S", nominal.geometry.markers, 3))
-    whole = numbers.round().to(torch.int64)
-    if bool((whole != numbers).any()):
-        raise InputError.of("the tensor session", expected="whole numbers", got=numbers[:5].tolist())
-    return SessionMarkers(nominal, whole, tools)

@@ -76,19 +76,17 @@ class NumpyKinematics:
         given, out = _numbers(tool, "tool"), np.eye(4)
         if given.shape not in ((3,), (4, 4)) or not np.isfinite(given).all():
             raise InputError.of("`tool`", expected="finite numbers, (4, 4) or (3,)", got=given.shape)
-        out[:3, 3] = given if given.ndim == 1 else given[:3, 3]
-        if given.ndim == 2:
-            if given[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-                fix = "pass [[R, t], [0, 0, 0, 1]], not its transpose"
-                raise InputError.of("the last row of `tool`", expected=[0, 0, 0, 1], got=given[3].tolist(), fix=fix)
-            out[:3, :3] = given[:3, :3]
-            if np.abs(given[:3, :3].T @ given[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(given) < 0:
-                raise InputError.of("`tool`", expected="a rigid transform (4, 4) in m", got=given.tolist())
-        return out
+        if given.ndim == 1:
+            out[:3, 3] = given
+            return out
+        R, rest = given[:3, :3], given[3].tolist()
+        if rest != [0, 0, 0, 1] or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+            fix = "pass [[R, t], [0, 0, 0, 1]] in m, not its transpose"
+            raise InputError.of("`tool`", expected="a rigid transform (4, 4)", got=given.tolist(), fix=fix)
+        return given
 
     def _joints(self, q: object) -> Array:
-        given, n = named_columns(q, self.joint_names, "q"), len(self.joint_names)
-        values = _numbers(given, "q")
+        values, n = _numbers(named_columns(q, self.joint_names, "q"), "q"), len(self.joint_names)
         if values.ndim != 2 or values.shape[1] != n:
             fix = f"pass one row per configuration, joints in the order {', '.join(self.joint_names)}"
             raise InputError.of("`q` has the wrong shape", expected=f"(N, {n})", got=values.shape, fix=fix)
@@ -133,24 +131,20 @@ def _numbers(value: object, name: str) -> Array:
 
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     nominal, integrator = header["nominal"], header["integrator"]
-    if nominal["kind"] != "robot":
-        raise InputError.of("the model", expected="that of a robot", got="a plain function", fix="use `dc.load`")
-    if integrator["kind"] not in TABLEAUS:
-        got, fix = integrator["kind"], "fit with dc.RK4 or dc.RK8, or use `dc.load`"
-        raise InputError.of("the model's time stepping", expected="fixed steps", got=got, fix=fix)
     kernels = header["joint_kernel"], header["task_kernel"]
-    own = [term["kernel"] for terms in kernels for term in terms if "kernel" in term]
-    if own:
-        expected = "kernels of this package"
-        raise InputError.of("the model's kernels", expected=expected, got=", ".join(own), fix="use `dc.load`")
-    chain = nominal_chain(nominal)
-    on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(arrays["tool"])
-    theta, size = arrays.get("unladen_theta", arrays["theta"]), 6 + 6 * len(chain.axes)
-    shifts = theta[size : size + arrays["tool"].size].reshape(-1, 3)
-    markers = arrays["tool"] + shifts
-    waves = nominal.get("waves", [])
-    last = len(theta) - 2 * len(waves)
-    sag = theta[size + arrays["tool"].size : last] if nominal["elastic"] else None
+    own = ", ".join(term["kernel"] for terms in kernels for term in terms if "kernel" in term)
+    for wrong, what, expected, got in (
+        (nominal["kind"] != "robot", "the model", "that of a robot", "a plain function"),
+        (integrator["kind"] not in TABLEAUS, "the time stepping", "fixed steps, of RK4 or RK8", integrator["kind"]),
+        (own, "the model's kernels", "kernels of this package", own),
+    ):
+        if wrong:
+            raise InputError.of(what, expected=expected, got=got, fix="use `dc.load`")
+    chain, tool = nominal_chain(nominal), arrays["tool"]
+    on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(tool)
+    waves, theta, size = nominal.get("waves", []), arrays.get("unladen_theta", arrays["theta"]), 6 + 6 * len(chain.axes)
+    shifts, last = theta[size : size + tool.size].reshape(-1, 3), len(theta) - 2 * len(waves)
+    sag = theta[size + tool.size : last] if nominal["elastic"] else None
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
     k0 = replace(k0, waves=waves_of(waves, k0.n, theta[last:]))
     tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
@@ -158,14 +152,13 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
         expected = f"an integer of at least 1 and at most {MOST_STEPS}"
         raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
-    tip = k0.poses(xi[0])[:, on]  # (N, P, 4, 4)
-    own = markers  # of every control: those of its session
+    tip, markers = k0.poses(xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:
-        own = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
-    z0 = (tip[..., :3, :3] @ own[..., None])[..., 0] + tip[..., :3, 3]
+        markers = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
+    z0 = (tip[..., :3, :3] @ markers[..., None])[..., 0] + tip[..., :3, 3]
     start = arrays.get("task_controls", z0.reshape(-1, 3))  # rows with payloads of their own
     task, _ = recorded_stages(kernels[1], start, arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
-    seen = arrays.get("registration_markers", markers)
-    at = on if len(seen) == len(markers) else [on[0]] * len(seen)
+    seen = arrays.get("registration_markers", tool + shifts)
+    at = on if len(seen) == len(tool) else [on[0]] * len(seen)
     return Program(flows[0], k0, flows[1], seen, tuple(at), chain.tips)

@@ -54,8 +54,7 @@ class RigidKinematics:
 
     Args:
         geometry: chain, joint errors, base in the measuring frame and markers. how: what they are, in words.
-        rms: root mean square distance of the markers from the model's at the configurations that are compared, m.
-        largest: largest such distance, m.
+        rms, largest: distances of the markers from the model's at the configurations that are compared, m.
         validated: name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold
             cross-validation; the geometric calibration had seen the measurements of all of them).
     """
@@ -94,27 +93,27 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
         and so do its rigid kinematics. Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, one to two
         seconds for 400 configurations.
     """
-    on = Compared.of(model, transmission=transmission)
-    found = _project(model, on.x, on.y)
-    candidates = {PROJECTION: found.geometry}
+    on, own, start = Compared.of(model, transmission=transmission), model.geometry, model.nominal.geometry
+    if start.markers != own.markers:  # a registration found others
+        start = start.with_tool(own.tool, own.on)
+    first = identify(start, on.x, on.y)  # prior deviations by maximum likelihood
+    candidates = {PROJECTION: _refit(model, on, like=first)}
     if model.rigid_errors is not None and not transmission:
-        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, on.x, on.y)
-    validated = _validate(model, candidates, found, on)
+        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, on)
+    validated = _validate(model, candidates, first, on)
     how = min(validated, key=lambda name: validated[name])
-    return _compared(candidates[how], how, on, validated)
+    return on.compared(candidates[how], how, validated)
 
 
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
-    nominal = Geometry.nominal(model.robot).joint_errors
-    return _with_errors(model, nominal, "nominal kinematics", transmission=transmission)
+    return _with_errors(model, None, "nominal kinematics", transmission=transmission)
 
 
 def geometric_kinematics(model: CalibratedKinematics) -> RigidKinematics:
     """The geometric calibration that the model was fitted from; without one, the projection of the model."""
-    if model.rigid_errors is None:
-        return rigid_kinematics(model)
-    return _with_errors(model, model.rigid_errors, GEOMETRIC)
+    errors = model.rigid_errors
+    return rigid_kinematics(model) if errors is None else _with_errors(model, errors, GEOMETRIC)
 
 
 def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
@@ -128,19 +127,13 @@ def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     """The joint offsets that bring the nominal kinematics closest to the model at the measured configurations."""
     on = Compared.of(model)
-    points = on.x, on.y
-    start = _placed(model, Geometry.nominal(model.robot).joint_errors, *points)
-    noise = _noise(start, *points)
+    start = geometry = _placed(model, None, on)
+    offsets = on.x.new_zeros(on.x.shape[1])
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
-        offsets = fit_joint_offsets(start, *points, std, noise, **PRECISE)
-        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, *points)
-        noise = _noise(geometry, *points)
-    return JointOffsets(offsets, _compared(geometry, "joint offsets", on, {}))
-
-
-def distances(geometry: Geometry, x: Tensor, y: Tensor) -> Tensor:
-    """Distances (N, P) of markers at joint values x (N, n) from points y (N, P, 3) [m]."""
-    return (geometry.points(x) - y).norm(dim=-1)
+        noise = _noise(float((geometry.points(on.x) - on.y).square().sum(-1).mean().sqrt()))
+        offsets = fit_joint_offsets(start, on.x, on.y, std, noise, **PRECISE)
+        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, on)
+    return JointOffsets(offsets, on.compared(geometry, "joint offsets", {}))
 
 
 def joint_motion(model: CalibratedKinematics, q: Tensor) -> Tensor:
@@ -178,67 +171,65 @@ class Compared(NamedTuple):
         x = joint_motion(model, q) if transmission else q
         return cls(x.detach().to(HOST), model(q).detach().to(HOST), judged.to(HOST), f"{int(judged.sum())} {where}")
 
+    def rows(self, some: Tensor) -> Compared:
+        """Some of them, (N,) boolean."""
+        return self._replace(x=self.x[some], y=self.y[some], judged=self.judged[some])
 
-def _compared(geometry: Geometry, how: str, on: Compared, validated: Mapping[str, float]) -> RigidKinematics:
-    d = distances(geometry, on.x[on.judged], on.y[on.judged])
-    return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
+    def distances(self, geometry: Geometry) -> Tensor:
+        """Distances (N, P) of markers from the model's where these count [m]."""
+        return (geometry.points(self.x[self.judged]) - self.y[self.judged]).norm(dim=-1)
+
+    def compared(self, geometry: Geometry, how: str, validated: Mapping[str, float]) -> RigidKinematics:
+        """A geometry with its distances from the model."""
+        d = self.distances(geometry)
+        return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
 
 
 def _with_errors(
-    model: CalibratedKinematics, joint_errors: Tensor, how: str, *, transmission: bool = False
+    model: CalibratedKinematics, joint_errors: Tensor | None, how: str, *, transmission: bool = False
 ) -> RigidKinematics:
     on = Compared.of(model, transmission=transmission)
-    return _compared(_placed(model, joint_errors, on.x, on.y), how, on, {})
+    return on.compared(_placed(model, joint_errors, on), how, {})
 
 
-def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identification:
-    """Prior deviations by maximum likelihood, then plain least squares: nothing in a prediction is an outlier."""
-    start, own = model.nominal.geometry, model.geometry
-    if start.markers != own.markers:  # a registration found others
-        start = start.with_tool(own.tool, own.on)
-    first = identify(start, x, y)
-    return _refit(model, x, y, like=first)
+def _noise(rms: float) -> float:
+    """The RMS of one coordinate, m."""
+    return max(rms / sqrt(3), LIMITS.smallest_noise_m)
 
 
-def _refit(model: CalibratedKinematics, x: Tensor, y: Tensor, *, like: Identification) -> Identification:
-    """The geometry that is closest to points, for the noise and the prior deviations of another fit."""
+def _refit(model: CalibratedKinematics, on: Compared, *, like: Identification) -> Geometry:
+    """The geometry that is closest, by plain least squares: nothing in a prediction is an outlier.
+
+    Noise and prior deviations are those of another fit.
+    """
     own = model.geometry
     start = replace(model.nominal.geometry.with_tool(own.tool, own.on), base=own.base)
-    noise = max(like.rms / sqrt(3), LIMITS.smallest_noise_m)
     prior = replace(like.prior, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
-    return identify(start, x, y, noise=noise, prior=prior)
+    return identify(start, on.x, on.y, noise=_noise(like.rms), prior=prior).geometry
 
 
-def _placed(model: CalibratedKinematics, joint_errors: Tensor, x: Tensor, y: Tensor) -> Geometry:
-    """A geometry with given joint errors: its base and markers close to the model's, unless others fit better."""
-    start = replace(model.geometry, joint_errors=joint_errors)
-    best = register(start, x, y)
-    noise = max(best.rms / sqrt(3), LIMITS.smallest_noise_m)
+def _placed(model: CalibratedKinematics, joint_errors: Tensor | None, on: Compared) -> Geometry:
+    """A geometry with given joint errors, or none: base and markers close to the model's, unless others fit better."""
+    errors = Geometry.nominal(model.robot).joint_errors if joint_errors is None else joint_errors
+    start = replace(model.geometry, joint_errors=errors)
+    best = register(start, on.x, on.y)
     prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
-    near = identify(start, x, y, noise=noise, prior=prior)
+    near = identify(start, on.x, on.y, noise=_noise(best.rms), prior=prior)
     found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + LIMITS.smallest_noise_m else best
     return replace(found.geometry, joint_errors=start.joint_errors)
 
 
 def _validate(
-    model: CalibratedKinematics, candidates: Mapping[str, Geometry], found: Identification, on: Compared
+    model: CalibratedKinematics, candidates: Mapping[str, Geometry], first: Identification, on: Compared
 ) -> dict[str, float]:
     """RMS distance of each candidate from the model at configurations left out of its fit, m."""
-    x, y = on.x, on.y
-    fold = torch.randperm(len(x), generator=seeded(0), device=HOST) % FOLDS
+    fold = torch.randperm(len(on.x), generator=seeded(0), device=HOST) % FOLDS
     squares: dict[str, list[Tensor]] = {name: [] for name in candidates}
-    for out in (fold == k for k in range(min(FOLDS, len(x)))):
+    for out in (fold == k for k in range(min(FOLDS, len(fold)))):
+        kept = on.rows(~out)
         for name, geometry in candidates.items():
-            kept = x[~out], y[~out]
-            if name == PROJECTION:
-                fitted = _refit(model, *kept, like=found).geometry
-            else:
-                fitted = _placed(model, geometry.joint_errors, *kept)
-            own = out & on.judged
-            squares[name].append(distances(fitted, x[own], y[own]).square().flatten())
+            again = (
+                _refit(model, kept, like=first) if name == PROJECTION else _placed(model, geometry.joint_errors, kept)
+            )
+            squares[name].append(on.rows(out).distances(again).square().flatten())
     return {name: float(torch.cat(parts).mean().sqrt()) for name, parts in squares.items()}
-
-
-def _noise(geometry: Geometry, x: Tensor, y: Tensor) -> float:
-    """RMS of one coordinate of what a geometry leaves, m."""
-    return max(float(distances(geometry, x, y).square().mean().sqrt()) / sqrt(3), LIMITS.smallest_noise_m)

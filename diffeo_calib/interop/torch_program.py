@@ -1,4 +1,8 @@
-"""Calibrated models as programs of torch: for torch.export, torch.compile, torch.jit.trace, and ONNX."""
+"""Calibrated models as programs of torch: for torch.export, torch.compile, torch.jit.trace, and ONNX.
+
+Straight-line code on buffers, without choices by values or sizes: the constants of runtime/ and its formulas, with
+operations that all of these understand, in double or single precision.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +11,32 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import embedding
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.torch_modules import TORCH, Constants
+from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import tip_poses
-from diffeo_calib.runtime.flow import advanced
+from diffeo_calib.runtime.flow import Operations, advanced
+from diffeo_calib.runtime.tables import TURN
 
 OUTPUTS = ("points", "tool_poses", "poses")
 PRECISIONS = {torch.float64: 1e-9, torch.float32: 1e-4}
@@ -37,6 +45,70 @@ EXAMPLE_ROWS = 3
 """Rows of the input with which programs are recorded; they run on any number."""
 DESCRIPTION = "diffeo_calib.json"
 """Name of the description inside ``.pt2`` files."""
+
+
+class Constants(nn.Module):
+    """A record of runtime/ as its formulas take it: floating-point arrays as buffers, other arrays as lists.
+
+    Args:
+        record: a flow, a chain, or a part of these.
+    """
+
+    def __init__(self, record: Any) -> None:
+        super().__init__()
+        for field in fields(record):
+            value = getattr(record, field.name)
+            if isinstance(value, np.ndarray) and value.dtype == np.float64:
+                tensor = torch.tensor(np.ascontiguousarray(value), dtype=torch.float64, device=HOST)
+                self.register_buffer(field.name, tensor)
+            elif isinstance(value, np.ndarray):
+                setattr(self, field.name, value.tolist())
+            elif field.name == "terms":
+                self.terms = nn.ModuleList(map(Constants, value))
+            elif field.name != "stages":  # tables: their cells are buffers
+                setattr(self, field.name, Constants(value) if is_dataclass(value) else value)
+
+
+def _rigid_inverse(poses: Tensor) -> Tensor:
+    R = poses[..., :3, :3].mT
+    top = torch.cat([R, -R @ poses[..., :3, 3:]], -1)
+    return torch.cat([top, poses[..., 3:, :]], -2)
+
+
+def _cells_around(starts: Tensor, cells: Tensor, t: Tensor) -> Sequence[Tensor]:
+    """See runtime/tables.py: by halving, since ONNX has no search in sorted numbers."""
+    place = torch.zeros_like(t, dtype=torch.int64)
+    for power in reversed(range(len(starts).bit_length() - 1)):
+        further = place + (1 << power)
+        place = torch.where(starts[further] <= t, further, place)
+    return embedding(place, cells.mT).unbind(-1)
+
+
+def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tensor:
+    """x + sum_k c_k slope_k. (Not with single numbers: onnxruntime rounds those beside a product of matrices.)"""
+    if not slopes:
+        return x
+    return x + (torch.stack(list(slopes)) * coefficients[: len(slopes), None, None]).sum(0)
+
+
+TORCH = Operations(
+    *(torch.sin, torch.cos, lambda x: x - TURN * torch.floor(x * (1.0 / TURN))),
+    *(torch.stack, torch.cat, torch.ones_like, torch.broadcast_to),
+    *(lambda values, floor: values.clamp(min=floor), lambda name, r2: PROFILES[name].derivative(r2, 0)),
+    *(_cells_around, _combined, twist_transform, _rigid_inverse),
+)
+
+
+class _ConstantPoints(Constants):
+    """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
+
+    markers: Tensor
+    on: tuple[int, ...]
+
+    def forward(self, q: Tensor) -> Tensor:
+        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
+        placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
+        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH).reshape(-1, self.markers.numel())
 
 
 class TorchProgram(nn.Module):
@@ -101,18 +173,6 @@ class TorchProgram(nn.Module):
             return points
         poses = of_frames(poses_of_triangles(points.unflatten(1, (-1, POINTS))))
         return poses if self.to_frame is None else self.to_frame @ poses
-
-
-class _ConstantPoints(Constants):
-    """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
-
-    markers: Tensor
-    on: tuple[int, ...]
-
-    def forward(self, q: Tensor) -> Tensor:
-        tips = tip_poses(self.chain, advanced(self.joint_flow, q, TORCH), TORCH)[:, list(self.on)]  # (N, P, 4, 4)
-        placed = (tips[..., :3, :3] @ self.markers[..., None]).squeeze(-1) + tips[..., :3, 3]
-        return advanced(self.task_flow, placed.reshape(-1, 3), TORCH).reshape(-1, self.markers.numel())
 
 
 def export_torch(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from xml.parsers import expat
@@ -89,15 +89,15 @@ def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
         if not torch.equal(error, torch.eye(4, dtype=error.dtype, device=error.device))
     }
     elements = _joint_elements(content)
-    edits: list[_Edit] = []
+    edits: list[tuple[slice, bytes]] = []
     for name, origin in origins.items():
         found = [element for element in elements if element.name == name]
         if len(found) != 1:
             what, expected = f"the joint '{name}' in the URDF of robot '{chain.name}'", "one <joint> with this name"
             raise RobotError.of(what, expected=expected, got=len(found), fix="pass its own URDF")
         edits += _origin_edits(content, found[0], origin)
-    for edit in sorted(edits, key=lambda e: e.start, reverse=True):  # from the end, so that places stay right
-        content = content[: edit.start] + edit.text + content[edit.stop :]
+    for place, text in sorted(edits, key=lambda edit: edit[0].start, reverse=True):  # so that places stay right
+        content = content[: place.start] + text + content[place.stop :]
     _check_read_back(geometry, content)
     return content
 
@@ -109,15 +109,6 @@ class _Element:
     name: str
     start: int
     origin: int | None = None
-
-
-@dataclass(frozen=True)
-class _Edit:
-    """Replace content[start:stop]."""
-
-    start: int
-    stop: int
-    text: bytes
 
 
 def _joint_elements(content: bytes) -> list[_Element]:
@@ -144,22 +135,23 @@ def _joint_elements(content: bytes) -> list[_Element]:
     return found
 
 
-def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[_Edit]:
-    """Edits that give a joint another origin."""
-    xyz, rpy = origin_numbers(origin)
-    numbers: dict[bytes, list[float]] = {b"xyz": xyz, b"rpy": rpy}
+def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[tuple[slice, bytes]]:
+    """Places in the text, and what replaces them, to give a joint another origin."""
+    numbers = dict(zip((b"xyz", b"rpy"), origin_numbers(origin), strict=True))
+    texts = {
+        name: " ".join(map(repr, values)).encode() for name, values in numbers.items()
+    }  # read back to the last bit
     if joint.origin is None:
-        _, stop = _attributes(content, joint.start, b"joint")
-        inside = content.index(b">", stop) + 1
+        inside = content.index(b">", _attributes(content, joint.start, b"joint")[1]) + 1
         space = re.compile(rb"\s*").match(content, inside)
-        yield _Edit(inside, inside, (space[0] if space else b"") + b"<origin" + _new_attributes(numbers) + b"/>")
+        attributes = b"".join(b' %b="%b"' % named for named in texts.items())
+        yield slice(inside, inside), (space[0] if space else b"") + b"<origin" + attributes + b"/>"
         return
     places, stop = _attributes(content, joint.origin, b"origin")
     for name, place in places.items():
         if name in numbers and [float(word) for word in content[place].split()] != numbers[name]:
-            yield _Edit(place.start, place.stop, _text(numbers[name]))
-    missing = {name: value for name, value in numbers.items() if name not in places}
-    yield _Edit(stop, stop, _new_attributes(missing))
+            yield place, texts[name]
+    yield slice(stop, stop), b"".join(b' %b="%b"' % named for named in texts.items() if named[0] not in places)
 
 
 def _attributes(content: bytes, start: int, tag: bytes) -> tuple[dict[bytes, slice], int]:
@@ -175,35 +167,19 @@ def _attributes(content: bytes, start: int, tag: bytes) -> tuple[dict[bytes, sli
     return places, stop
 
 
-def _new_attributes(numbers: dict[bytes, list[float]]) -> bytes:
-    return b"".join(b" " + name + b'="' + _text(value) + b'"' for name, value in numbers.items())
-
-
-def _text(numbers: list[float]) -> bytes:
-    """Numbers as text that is read back to the last bit."""
-    return " ".join(map(repr, numbers)).encode()
-
-
 def _check_same(chain: Tree, other: Tree, path: Path) -> None:
     """Raise RobotError unless a file describes the nominal robot of a model."""
-    for what, mine, theirs in (
-        ("joints", chain.moving_names, other.moving_names),
-        ("kinds of joints", chain.kinds, other.kinds),
-    ):
+    names, kinds = (chain.moving_names, other.moving_names), (chain.kinds, other.kinds)
+    for what, (mine, theirs) in (("joints", names), ("kinds of joints", kinds)):
         if mine != theirs:
             expected, fix = ", ".join(mine), "pass the URDF that the model was fitted with"
             raise RobotError.of(f"the {what} of '{path}'", expected=expected, got=", ".join(theirs), fix=fix)
-    names = chain.moving_names
-    numbers = [
-        *zip((*names, *chain.ends), chain.place_offsets, other.place_offsets, strict=False),
-        *zip(names, chain.axes, other.axes, strict=True),
-        *zip(names, chain.coupling, other.coupling, strict=True),
-        *zip(names, chain.coupling_offset, other.coupling_offset, strict=True),
-    ]
-    for joint, mine, theirs in numbers:
-        if float((mine - theirs).abs().max()) > SAME_ROBOT_TOLERANCE:
-            what = f"'{path}' is not the URDF that the model was fitted with: it differs at '{joint}'"
-            raise RobotError.of(what, fix="pass the nominal URDF of the fit")
+    ends = (*chain.moving_names, *chain.ends)
+    for numbers in ("place_offsets", "axes", "coupling", "coupling_offset"):
+        for joint, mine, theirs in zip(ends, getattr(chain, numbers), getattr(other, numbers), strict=False):
+            if float((mine - theirs).abs().max()) > SAME_ROBOT_TOLERANCE:
+                what = f"'{path}' is not the URDF that the model was fitted with: it differs at '{joint}'"
+                raise RobotError.of(what, fix="pass the nominal URDF of the fit")
 
 
 def _check_read_back(geometry: Geometry, content: bytes) -> None:
@@ -211,9 +187,7 @@ def _check_read_back(geometry: Geometry, content: bytes) -> None:
     chain = geometry.chain
     again = read_urdf(content, chain.base, chain.tips, Path("the corrected URDF"), chain.loads)
     q = 4 * torch.rand(16, chain.n, dtype=torch.float64, device=HOST, generator=seeded(0)) - 2
-    eye = torch.eye(4, dtype=torch.float64, device=HOST)
-    tips = torch.zeros(len(chain.tips), 3, dtype=torch.float64, device=HOST)
-    expected = Geometry(chain, eye, geometry.joint_errors, tips, chain.tips).poses(q)
+    expected = replace(Geometry.nominal(chain), joint_errors=geometry.joint_errors).poses(q)
     size = 1.0 + float(expected[..., :3, 3].norm(dim=-1).max())
     error = float((again(q) - expected).abs().max()) / size
     if not error < READ_BACK:

@@ -146,7 +146,7 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
 
 
 class Operations(NamedTuple):
-    """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_modules.py.
+    """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py.
 
     ``within_turn`` are angles in [0, 2 pi), ``profile`` is a radial function by its name, ``at_least`` the larger of
     values and a number, ``combined`` the state at a Runge-Kutta stage, ``cells_around`` that of tables.py, ``inverse``

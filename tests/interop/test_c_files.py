@@ -18,7 +18,7 @@ from robots_bank import CHAINS, draw
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop import CFiles, write_c
-from diffeo_calib.interop.c_constants import array, number
+from diffeo_calib.interop.c_source import array, number
 from diffeo_calib.kinematics.provenance import Provenance
 
 FUNCTIONS = ("markers", "tool_pose", "newton_step")

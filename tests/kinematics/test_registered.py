@@ -14,7 +14,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.interop.model_header import describe_registration, rebuild_registration
+from diffeo_calib.interop.model_header import describe, rebuild_registration
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, check_isotropic, moved
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
@@ -338,7 +338,9 @@ def test_covariances_stay_positive(arm: Case, *, new: bool) -> None:
 
 def test_files_that_do_not_fit_together(arm: Case) -> None:
     """Entries that are missing or of another kind, and tensors of another shape, are refused."""
-    entry, tensors = describe_registration(record(arm.model.registered(seen(arm, slice(0, 8), transform(18)))))
+    header, tensors = describe(arm.model.registered(seen(arm, slice(0, 8), transform(18))))
+    entry = header["registration"]
+    tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("registration_")}
     assert rebuild_registration(entry, tensors, 6).rows == 8
     for wrong in ({}, entry | {"mood": 1}, entry | {"excess": "much"}, entry | {"free": "all"}, entry | {"same": 1}):
         with pytest.raises(InputError, match="registration"):
