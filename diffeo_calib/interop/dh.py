@@ -40,19 +40,13 @@ SHORT_PROJECTION = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DHTable:
-    """A Denavit-Hartenberg table with what it cannot hold.
+    """A Denavit-Hartenberg table with what it cannot hold."""
 
-    Args:
-        names: names of the moving joints, one per row. rows: see :class:`DHRow` [m, rad].
-        convention: "standard" or "craig". base: (4, 4) from the robot's base to the frame before the first row [m].
-        tool: (4, 4) from the frame after the last row to the tip [m].
-    """
-
-    names: Sequence[str]
-    rows: Sequence[DHRow]
-    convention: str
-    base: Tensor
-    tool: Tensor
+    names: Sequence[str]  # names of the moving joints, one per row
+    rows: Sequence[DHRow]  # see :class:`DHRow` [m, rad]
+    convention: str  # "standard" or "craig"
+    base: Tensor  # (4, 4) from the robot's base to the frame before the first row [m]
+    tool: Tensor  # (4, 4) from the frame after the last row to the tip [m]
 
     def chain(self) -> Tree:
         """The chain of the rows, without base and tool."""

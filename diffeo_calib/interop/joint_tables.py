@@ -32,22 +32,14 @@ FIXED_POINT_STEPS = 20
 
 @dataclass(frozen=True, eq=False)
 class CorrectionTable:
-    """Transmission errors of one joint over the range in which it was measured.
+    """Transmission errors of one joint over the range in which it was measured."""
 
-    Args:
-        joint: its name. turns: whether it is revolute.
-        values: (M,) joint values q, evenly spaced from the smallest measured value to the largest [rad or m].
-        errors: (M,) e(q): what the joint moves beyond its reading [rad or m].
-        corrections: (M,) what a controller adds to q so that the joint comes to q [rad or m].
-        between: largest error of linear interpolation between the rows [rad or m].
-    """
-
-    joint: str
-    turns: bool
-    values: Tensor
-    errors: Tensor
-    corrections: Tensor
-    between: float
+    joint: str  # its name
+    turns: bool  # whether it is revolute
+    values: Tensor  # (M,) joint values q, evenly spaced from the smallest measured value to the largest [rad or m]
+    errors: Tensor  # (M,) e(q): what the joint moves beyond its reading [rad or m]
+    corrections: Tensor  # (M,) what a controller adds to q so that the joint comes to q [rad or m]
+    between: float  # largest error of linear interpolation between the rows [rad or m]
 
 
 def correction_tables(

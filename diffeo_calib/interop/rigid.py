@@ -50,34 +50,26 @@ TOLERATED_RMS_RATIO = 1.01
 
 @dataclass(frozen=True, eq=False)
 class RigidKinematics:
-    """Rigid kinematics in place of a calibrated model, and how far they are from it.
+    """Rigid kinematics in place of a calibrated model, and how far they are from it."""
 
-    Args:
-        geometry: chain, joint errors, base in the measuring frame and markers. how: what they are, in words.
-        rms, largest: distances of the markers from the model's at the configurations that are compared, m.
-        validated: name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold
-            cross-validation; the geometric calibration had seen the measurements of all of them).
-    """
-
-    geometry: Geometry
-    how: str
+    geometry: Geometry  # chain, joint errors, base in the measuring frame and markers
+    how: str  # what they are, in words
+    # rms, largest: distances of the markers from the model's at the configurations that are compared, m
     rms: float
     largest: float
+    # name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold
+    # cross-validation; the geometric calibration had seen the measurements of all of them)
     validated: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class JointOffsets:
-    """The best joint offsets alone, all other geometry nominal.
+    """The best joint offsets alone, all other geometry nominal."""
 
-    Args:
-        offsets: (n,) to be added to the joints' readings before nominal kinematics [rad or m]; zero where the base or
-            the markers could explain the same.
-        rigid: the kinematics with these offsets, and how far they are from the model.
-    """
-
+    # (n,) to be added to the joints' readings before nominal kinematics [rad or m]; zero where the base or the markers
+    # could explain the same
     offsets: Tensor
-    rigid: RigidKinematics
+    rigid: RigidKinematics  # the kinematics with these offsets, and how far they are from the model
 
 
 def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
@@ -147,16 +139,12 @@ class Compared(NamedTuple):
 
     Where nothing measured positions, rows are at a few places, such as sockets, at which kinematics agree that differ
     elsewhere: there the model's joint ranges take part, too, and distances are those over the ranges.
-
-    Args:
-        x: (N, n) joint values for the geometry, rad or m. y: (N, P, 3) the model's points, m.
-        judged: (N,) boolean, where distances count. where: these configurations, in words.
     """
 
-    x: Tensor
-    y: Tensor
-    judged: Tensor
-    where: str
+    x: Tensor  # (N, n) joint values for the geometry, rad or m
+    y: Tensor  # (N, P, 3) the model's points, m
+    judged: Tensor  # (N,) boolean, where distances count
+    where: str  # these configurations, in words
 
     @classmethod
     def of(cls, model: CalibratedKinematics, *, transmission: bool = False) -> Compared:

@@ -64,20 +64,14 @@ LARGEST_FILE = 1_000_000
 
 @dataclass(frozen=True)
 class DHFile:
-    """The table of a file.
+    """The table of a file."""
 
-    Args:
-        path: the file. names: of the joints. rows: their parameters [m, rad].
-        convention: "standard" or "craig", empty if the file does not say it. units: how it was read, in words.
-        sure: whether words without another meaning say the convention.
-    """
-
-    path: Path
-    names: list[str]
-    rows: list[DHRow]
-    convention: str
-    units: str
-    sure: bool = True
+    path: Path  # the file
+    names: list[str]  # of the joints
+    rows: list[DHRow]  # their parameters [m, rad]
+    convention: str  # "standard" or "craig", empty if the file does not say it
+    units: str  # how it was read, in words
+    sure: bool = True  # whether words without another meaning say the convention
 
     @classmethod
     def read(cls, path: Path) -> DHFile:

@@ -21,15 +21,11 @@ from diffeo_calib.common.errors import InputError
 class GearWaves:
     """K waves; their coefficients are C and S of each wave in turn, (2 K,) in the unit of the joint.
 
-    Args:
-        joints: numbers l of the active joints, K of them; a joint may have several waves.
-        frequencies: w, rad per unit of the joint; for an angle, periods per turn.
-
     Raises InputError: a negative joint number, or a frequency that is not positive.
     """
 
-    joints: tuple[int, ...] = ()
-    frequencies: tuple[float, ...] = ()
+    joints: tuple[int, ...] = ()  # numbers l of the active joints, K of them; a joint may have several waves
+    frequencies: tuple[float, ...] = ()  # w, rad per unit of the joint; for an angle, periods per turn
 
     def __post_init__(self) -> None:
         for joint, frequency in zip(self.joints, self.frequencies, strict=True):

@@ -39,19 +39,14 @@ from diffeo_calib.robots.tree import Tree
 class Geometry:
     """A robot with its base, error transforms and markers.
 
-    Args:
-        chain: the nominal robot. base: (4, 4) the robot's base in the measuring frame [m].
-        joint_errors: (n_all, 4, 4) rigid transforms E_l [m], one for each of ``chain.moving_names``.
-        tool: (P, 3) markers in the frames of their tips [m].
-        on: P names of these tips, or one for all markers; the first of ``chain.tips`` for all by default.
-
     Raises InputError: wrong shapes, values that are not finite, transforms that are not rigid, a tip that is not there.
     """
 
-    chain: Tree
-    base: Tensor
-    joint_errors: Tensor
-    tool: Tensor
+    chain: Tree  # the nominal robot
+    base: Tensor  # (4, 4) the robot's base in the measuring frame [m]
+    joint_errors: Tensor  # (n_all, 4, 4) rigid transforms E_l [m], one for each of ``chain.moving_names``
+    tool: Tensor  # (P, 3) markers in the frames of their tips [m]
+    # P names of these tips, or one for all markers; the first of ``chain.tips`` for all by default
     on: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

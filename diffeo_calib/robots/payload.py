@@ -21,17 +21,11 @@ ABSURD, BEYOND = 1000.0, 1.1
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Masses at one place of a robot.
+    """Masses at one place of a robot."""
 
-    Args:
-        link: name of the tip, or of the branch without markers (`load`), at whose origin the mass sits.
-        masses: of the robot everywhere (), or of N rows (N,), in any unit.
-        unit: the mass, in the same unit, that counts as one: coefficients are sags under it. Positive.
-    """
-
-    link: str
-    masses: Tensor
-    unit: float
+    link: str  # name of the tip, or of the branch without markers (`load`), at whose origin the mass sits
+    masses: Tensor  # of the robot everywhere (), or of N rows (N,), in any unit
+    unit: float  # the mass, in the same unit, that counts as one: coefficients are sags under it. Positive.
 
     def __post_init__(self) -> None:
         if not self.unit > 0:

@@ -50,16 +50,11 @@ PAYLOAD_CENTRE = (0.01, -0.02, 0.08)
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """The true contributions to the error at some configurations.
+    """The true contributions to the error at some configurations."""
 
-    Args:
-        transmission: (N, 6) true minus measured joint angles [rad]. gravity: (N, 6) gravity sag of the joints [rad].
-        geometry: (N, P, 3) displacement of the markers by the geometric errors alone [m].
-    """
-
-    transmission: Tensor
-    gravity: Tensor
-    geometry: Tensor
+    transmission: Tensor  # (N, 6) true minus measured joint angles [rad]
+    gravity: Tensor  # (N, 6) gravity sag of the joints [rad]
+    geometry: Tensor  # (N, P, 3) displacement of the markers by the geometric errors alone [m]
 
 
 @methods_outside_inference_mode

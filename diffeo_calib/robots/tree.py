@@ -36,16 +36,12 @@ BASE = -1
 
 
 class Ends(NamedTuple):
-    """Links at which a tree ends, by the numbers of the last joints before them, -1 for the base.
+    """Links at which a tree ends, by the numbers of the last joints before them, -1 for the base."""
 
-    Args:
-        tips: names of the frames whose poses are computed, with their numbers.
-        loads: the same where nothing is measured, but whose weight bends the robot.
-        ground: number of the link on the ground, where the direction of gravity is constant; the base by default.
-    """
-
-    tips: Mapping[str, int]
+    tips: Mapping[str, int]  # names of the frames whose poses are computed, with their numbers
+    # the same where nothing is measured, but whose weight bends the robot
     loads: Mapping[str, int] = MappingProxyType({})
+    # number of the link on the ground, where the direction of gravity is constant; the base by default
     ground: int = BASE
 
 

@@ -36,43 +36,33 @@ HARMLESS = {
 
 @dataclass(frozen=True)
 class JointElement:
-    """A <joint> of the file.
+    """A <joint> of the file."""
 
-    Args:
-        name, kind, parent, child: its attributes and links; any ``kind``.
-        origin: (4, 4) pose in the parent link's frame [m]. axis: in its own frame, of any length.
-        limits: lower and upper [rad or m], infinite where the file gives none and NaN where it says NaN.
-        driver: name of the joint that it mimics, empty if the file forgets it; None without <mimic>.
-        multiplier, offset: of the mimic.
-    """
-
+    # name, kind, parent, child: its attributes and links; any ``kind``
     name: str
     kind: str
     parent: str
     child: str
-    origin: Tensor
-    axis: tuple[float, ...]
+    origin: Tensor  # (4, 4) pose in the parent link's frame [m]
+    axis: tuple[float, ...]  # in its own frame, of any length
+    # lower and upper [rad or m], infinite where the file gives none and NaN where it says NaN
     limits: tuple[float, float]
-    driver: str | None
+    driver: str | None  # name of the joint that it mimics, empty if the file forgets it; None without <mimic>
+    # multiplier, offset: of the mimic
     multiplier: float
     offset: float
 
 
 @dataclass(frozen=True)
 class URDF:
-    """The kinematics of a robot in a file.
+    """The kinematics of a robot in a file."""
 
-    Args:
-        path: the file, for messages. name: the robot's. links: names of its links. joints: all of them, in order.
-        ignored: harmless faults of the file. macros: whether xacro macros are left in it.
-    """
-
-    path: Path
-    name: str
-    links: list[str]
-    joints: list[JointElement]
-    ignored: list[str]
-    macros: bool
+    path: Path  # the file, for messages
+    name: str  # the robot's
+    links: list[str]  # names of its links
+    joints: list[JointElement]  # all of them, in order
+    ignored: list[str]  # harmless faults of the file
+    macros: bool  # whether xacro macros are left in it
 
     @classmethod
     def parse(cls, content: bytes, path: Path) -> URDF:

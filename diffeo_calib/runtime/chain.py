@@ -28,17 +28,12 @@ SERIES_TERMS = 11
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; see robots/gear_waves.py.
+    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; see robots/gear_waves.py."""
 
-    Args:
-        joints: (K,) numbers l. selection: (K, n) units of these joints: several waves of one joint add up.
-        frequencies: (K,) w, periods per turn. coefficients: (K, 2) C and S, rad or m.
-    """
-
-    joints: tuple[int, ...]
-    selection: Array
-    frequencies: Array
-    coefficients: Array
+    joints: tuple[int, ...]  # (K,) numbers l
+    selection: Array  # (K, n) units of these joints: several waves of one joint add up
+    frequencies: Array  # (K,) w, periods per turn
+    coefficients: Array  # (K, 2) C and S, rad or m
 
     def slopes(self, x: Array) -> Array:
         """Derivative of :func:`turned`, which is diagonal: (N, n) -> (N, n)."""
@@ -61,22 +56,15 @@ def waves_of(config: Sequence[Sequence[float]], size: int, coefficients: Array) 
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """The sag of a joint's frame in one direction, and its family of features; see robots/gravity.py.
+    """The sag of a joint's frame in one direction, and its family of features; see robots/gravity.py."""
 
-    Args:
-        joint: number of the moving joint whose frame sags.
-        direction: (6,) unit twist in the frame before the joint's motion, translation first.
-        own: whether it is along the joint's own motion (else lateral).
-        places: numbers of the places at which masses pull; empty for a slide along its axis, where the feature is the
-            force itself.
-        loaded: whether the load is the payload, whose mass is known.
-    """
-
-    joint: int
-    direction: Array
-    own: bool
+    joint: int  # number of the moving joint whose frame sags
+    direction: Array  # (6,) unit twist in the frame before the joint's motion, translation first
+    own: bool  # whether it is along the joint's own motion (else lateral)
+    # numbers of the places at which masses pull; empty for a slide along its axis, where the feature is the force
+    # itself
     places: tuple[int, ...]
-    loaded: bool = False
+    loaded: bool = False  # whether the load is the payload, whose mass is known
 
     @property
     def size(self) -> int:
@@ -91,24 +79,16 @@ class Compliance:
 
 @dataclass(frozen=True, eq=False)
 class NominalChain:
-    """Constants of a robot, see robots/tree.py. Its F places are the frames of joints, tips, loads and the ground.
+    """Constants of a robot, see robots/tree.py. Its F places are the frames of joints, tips, loads and the ground."""
 
-    Args:
-        offsets: (F, 4, 4) constant transforms of the places [m]. before: (F,) the moving joints before them, or -1.
-        tips: names of the tips. grounded: whether the last place is the ground; else it is the base.
-        axes: (n_all, 3) joint axes in their own frames. revolute: (n_all,) False for prismatic joints.
-        motions: (4, n_all, 4, 4) C, S, D, L.
-        coupling: (n_all, n), coupling_offset: (n_all,): moving joints' values from the active ones'.
-    """
-
-    offsets: Array
-    before: np.ndarray
-    tips: tuple[str, ...]
-    grounded: bool
-    axes: Array
-    revolute: np.ndarray
-    motions: Array
-    coupling: Array
+    offsets: Array  # (F, 4, 4) constant transforms of the places [m]
+    before: np.ndarray  # (F,) the moving joints before them, or -1
+    tips: tuple[str, ...]  # names of the tips
+    grounded: bool  # whether the last place is the ground; else it is the base
+    axes: Array  # (n_all, 3) joint axes in their own frames
+    revolute: np.ndarray  # (n_all,) False for prismatic joints
+    motions: Array  # (4, n_all, 4, 4) C, S, D, L
+    coupling: Array  # (n_all, n), and below (n_all,): moving joints' values from the active ones'
     coupling_offset: Array
 
     @cached_property
@@ -170,38 +150,26 @@ class Sag:
     """Gravity sag: twist coordinates e . m, with unit vectors e of nominal frames and moments m of unknown masses.
 
     The moments are linear in the origins o_f of the nominal frames: m_k = sum_f W_kf o_f + w_k.
-
-    Args:
-        joints: (K,) the moving joint of every coordinate. axes: (K, 3) its unit vector in the joint's frame.
-        moments: (3 K, 3 F) W. forces: (K, 3) w, constant forces on prismatic joints.
-        directions: (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad].
     """
 
-    joints: np.ndarray
-    axes: Array
-    moments: Array
-    forces: Array
-    directions: Array
+    joints: np.ndarray  # (K,) the moving joint of every coordinate
+    axes: Array  # (K, 3) its unit vector in the joint's frame
+    moments: Array  # (3 K, 3 F) W
+    forces: Array  # (K, 3) w, constant forces on prismatic joints
+    directions: Array  # (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad]
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedChain:
-    """Constants of the formula in the module's docstring.
+    """Constants of the formula in the module's docstring."""
 
-    Args:
-        nominal: the robot. start: (4, 4) the base in the measuring frame [m].
-        offsets: (n_all, 4, 4) A_l [m]; constant error twists are multiplied in where there is no sag.
-        twists: (n_all, 6) constant error twists tau_l [m, rad]; zero where they are multiplied in.
-        tips: (T, 4, 4) O_tip [m]. sag: gravity sag. waves: of the active joints; None without.
-    """
-
-    nominal: NominalChain
-    start: Array
-    offsets: Array
-    twists: Array
-    tips: Array
-    sag: Sag | None = None
-    waves: Waves | None = None
+    nominal: NominalChain  # the robot
+    start: Array  # (4, 4) the base in the measuring frame [m]
+    offsets: Array  # (n_all, 4, 4) A_l [m]; constant error twists are multiplied in where there is no sag
+    twists: Array  # (n_all, 6) constant error twists tau_l [m, rad]; zero where they are multiplied in
+    tips: Array  # (T, 4, 4) O_tip [m]
+    sag: Sag | None = None  # gravity sag
+    waves: Waves | None = None  # of the active joints; None without
 
     @property
     def n(self) -> int:

@@ -28,22 +28,16 @@ class RadialTerm:
     """kappa(|F(x) - F(q_j)|^2) w_j summed over the controls, for every stage.
 
     F is the feature map of kernels/spaces.py: x / l on lines, (cos x, sin x) / l on circles.
-
-    Args:
-        profile: name of kappa. lines, circles: columns of x that it depends on, as indices.
-        scales: (lines + circles,) inverse length scales, lines first.
-        centre: (lines,) of the controls on the lines: differences of far points would lose digits.
-        right: (S, D + 1, C): (F, 1) times it, plus |F|^2 of the lines, is the squared distance from the controls.
-        weights: (S, C, n) their momenta times the kernel's output matrix.
     """
 
-    profile: str
+    profile: str  # name of kappa
+    # lines, circles: columns of x that it depends on, as indices
     lines: slice | list[int]
     circles: slice | list[int]
-    scales: Array
-    centre: Array
-    right: Array
-    weights: Array
+    scales: Array  # (lines + circles,) inverse length scales, lines first
+    centre: Array  # (lines,) of the controls on the lines: differences of far points would lose digits
+    right: Array  # (S, D + 1, C): (F, 1) times it, plus |F|^2 of the lines, is the squared distance from the controls
+    weights: Array  # (S, C, n) their momenta times the kernel's output matrix
 
     @property
     def size(self) -> int:
@@ -81,20 +75,14 @@ class RadialTerm:
 
 @dataclass(frozen=True, eq=False)
 class RecordedFlow:
-    """A flow on R^n (angles unwrapped) with the Runge-Kutta stages of its controls.
+    """A flow on R^n (angles unwrapped) with the Runge-Kutta stages of its controls."""
 
-    Args:
-        size: n. steps: number of equal steps.
-        coefficients: (s, s), weights: (s,) of the method, times the length of a step. terms: sums over the controls.
-        tables: functions of single joints, added to their own components; None without any.
-    """
-
-    size: int
-    steps: int
-    coefficients: Array
+    size: int  # n
+    steps: int  # number of equal steps
+    coefficients: Array  # (s, s), and below (s,): those of the method, times the length of a step
     weights: Array
-    terms: tuple[RadialTerm, ...]
-    tables: JointTables | None = None
+    terms: tuple[RadialTerm, ...]  # sums over the controls
+    tables: JointTables | None = None  # functions of single joints, added to their own components; None without any
 
     @property
     def vanishes(self) -> bool:

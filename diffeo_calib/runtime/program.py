@@ -25,22 +25,15 @@ MARKS = np.array([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """k1(q; m) = psi(k0(phi^-1(q); m)) for points m of the flange, without torch.
+    """k1(q; m) = psi(k0(phi^-1(q); m)) for points m of the flange, without torch."""
 
-    Args:
-        joint_flow: phi^-1. chain: k0. task_flow: psi.
-        markers: (P, 3) the measured markers in the frames of their tips [m].
-        on: numbers of the tips of the markers, P of them. tips: names of the tips.
-        tip: number of the tip that carries other points.
-    """
-
-    joint_flow: RecordedFlow
-    chain: CalibratedChain
-    task_flow: RecordedFlow
-    markers: Array
-    on: tuple[int, ...]
-    tips: tuple[str, ...] = ("",)
-    tip: int = 0
+    joint_flow: RecordedFlow  # phi^-1
+    chain: CalibratedChain  # k0
+    task_flow: RecordedFlow  # psi
+    markers: Array  # (P, 3) the measured markers in the frames of their tips [m]
+    on: tuple[int, ...]  # numbers of the tips of the markers, P of them
+    tips: tuple[str, ...] = ("",)  # names of the tips
+    tip: int = 0  # number of the tip that carries other points
 
     def at(self, tip: str) -> Program:
         """The same program for points on another tip."""

@@ -103,16 +103,12 @@ CIRCLE_SPACING_RAD = 8.0
 
 @dataclass(frozen=True, eq=False)
 class PeriodicSum:
-    """sum_j w_j kappa(2 (1 - cos(x - q_j)) / l^2) at one stage.
+    """sum_j w_j kappa(2 (1 - cos(x - q_j)) / l^2) at one stage."""
 
-    Args:
-        profile: name of kappa. lengthscale: l, a pure number. angles: (C,) q_j, rad. weights: (C,) w_j, rad.
-    """
-
-    profile: str
-    lengthscale: float
-    angles: Array
-    weights: Array
+    profile: str  # name of kappa
+    lengthscale: float  # l, a pure number
+    angles: Array  # (C,) q_j, rad
+    weights: Array  # (C,) w_j, rad
 
     @property
     def kinks(self) -> Array:
@@ -135,14 +131,10 @@ class PeriodicSum:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A function on the circle, interpolated in cells.
+    """A function on the circle, interpolated in cells."""
 
-    Args:
-        knots: (K + 1,) ascending from 0 to 2 pi. values: (K + 1, 3) f, f', f'' there; the last row repeats the first.
-    """
-
-    knots: Array
-    values: Array
+    knots: Array  # (K + 1,) ascending from 0 to 2 pi
+    values: Array  # (K + 1, 3) f, f', f'' there; the last row repeats the first
 
     @property
     def coefficients(self) -> Array:
@@ -156,22 +148,16 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class JointTables:
-    """Functions of single joints at every stage.
+    """Functions of single joints at every stage."""
 
-    Args:
-        joints: numbers of the L joints, ascending, as an index. stages: for every stage a table per joint.
-        selection: (L, n) units of these joints.
-        shifts: (L,) of the circles of the joints, which lie side by side on a line.
-        starts: (S, power of 2) first knots of the cells of a stage on this line, ascending; of each circle's first cell
-            a place before it. cells: (S, 7, K) first knot, and coefficients of (x - knot)^0 ... (x - knot)^5.
-    """
-
-    joints: slice | list[int]
-    stages: tuple[tuple[Table, ...], ...]
-    selection: Array
-    shifts: Array
+    joints: slice | list[int]  # numbers of the L joints, ascending, as an index
+    stages: tuple[tuple[Table, ...], ...]  # for every stage a table per joint
+    selection: Array  # (L, n) units of these joints
+    shifts: Array  # (L,) of the circles of the joints, which lie side by side on a line
+    # (S, power of 2) first knots of the cells of a stage on this line, ascending; of each circle's first cell a place
+    # before it
     starts: Array
-    cells: Array
+    cells: Array  # (S, 7, K) first knot, and coefficients of (x - knot)^0 ... (x - knot)^5.
 
     @classmethod
     def of(cls, joints: Sequence[int], stages: Sequence[Sequence[Table]], size: int) -> JointTables:
