@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import cos, inf, isfinite, pi, sin
+from math import inf, isfinite, pi
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from diffeo_calib.common.checks import index_of
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import RobotError, as_written, sentence, warn_user
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 from diffeo_calib.robots.tree import Chain, Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
@@ -107,8 +108,8 @@ def from_dh(
     parents = [index - 1 if row.parent is None else row.parent for index, row in enumerate(table)]
     joints, links = [], {-1: torch.eye(4, dtype=torch.float64, device="cpu")}
     for index, (row, joint_name) in enumerate(zip(table, names, strict=True)):
-        standard = convention == "standard"  # the joint moves first, in the previous frame
-        before, after = (links[-1], row_transform(row)) if standard else (_about_x(row), _about_z(row))
+        about_z, about_x = _parts(row)
+        before, after = (links[-1], about_z @ about_x) if convention == "standard" else (about_x, about_z)
         axis, place = (links[parents[index]] @ before)[:3, 2:].unbind(1)
         along = -axis @ place
         if float(along.abs()) > LONGEST_LINK_M:
@@ -130,13 +131,10 @@ def from_dh(
         return Chain(name, "base", "tip", joints)
     named = {f"tip_{k + 1}": end for k, end in enumerate(ends)} if tips is None else _tips(tips, len(table))
     loads = {names[end]: end for end in ends if end not in named.values()}
-    taken = [tip for tip in named if tip in loads or tip in ("", "base")]
-    if taken:
-        got, fix = (
-            f"'{taken[0]}', which {'is another end' if taken[0] in loads else 'is no name'}",
-            "choose other names",
-        )
-        raise RobotError.of("the name of a tip of the DH table", expected="one of its own", got=got, fix=fix)
+    if taken := [tip for tip in named if tip in loads or tip in ("", "base")]:
+        got = f"'{taken[0]}', which {'is another end' if taken[0] in loads else 'is no name'}"
+        what, fix = "the name of a tip of the DH table", "choose other names"
+        raise RobotError.of(what, expected="one of its own", got=got, fix=fix)
     # every row is two joints: a moving one after its parent's second, and a fixed one
     after = [number for index, parent in enumerate(parents) for number in (2 * parent + 1, 2 * index)]
     own, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
@@ -166,7 +164,8 @@ def _names(names: Sequence[str] | None, rows: int) -> list[str]:
 
 def row_transform(row: DHRow) -> Tensor:
     """The transform (4, 4) of a row of the standard convention, its joint at zero [m]."""
-    return _about_z(row) @ _about_x(row)
+    about_z, about_x = _parts(row)
+    return about_z @ about_x
 
 
 def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
@@ -179,33 +178,25 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
         row = DHRow(*values)
     if row.kind not in DH_KINDS:
         raise RobotError.of(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=as_written(row.kind))
-    lengths_and_angles = [row.a, row.alpha, row.d, row.theta, row.beta]
+    given = [row.a, row.alpha, row.d, row.theta, row.beta]
     try:
-        numbers = [float(value) for value in lengths_and_angles]
+        a, alpha, d, theta, beta = numbers = [float(value) for value in given]
     except (TypeError, ValueError) as error:
-        raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
+        raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(given)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
-    angle = max(numbers[1], *numbers[3:], key=abs)
+    angle = max(alpha, theta, beta, key=abs)
     if abs(angle) > LARGEST_ANGLE_RAD:
         warn_user(sentence(f"an angle in {what} is {angle:g} rad", fix="convert degrees: math.radians(90)"))
     parent = index_of(row.parent)
     if row.parent is not None and (parent is None or not -1 <= parent < index):
         expected = "the number of an earlier row, or -1 for the base"
         raise RobotError.of(f"the parent in {what}", expected=expected, got=as_written(row.parent))
-    a, alpha, d, theta, beta = numbers
     return replace(row, a=a, alpha=alpha, d=d, theta=theta, beta=beta, parent=parent)
 
 
-def _about_z(row: DHRow) -> Tensor:
-    c, s = cos(row.theta), sin(row.theta)
-    entries = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, row.d], [0, 0, 0, 1]]
-    return torch.tensor(entries, dtype=torch.float64, device="cpu")
-
-
-def _about_x(row: DHRow) -> Tensor:
-    (c, s), (cb, sb) = (cos(row.alpha), sin(row.alpha)), (cos(row.beta), sin(row.beta))
-    entries = [[1, 0, 0, row.a], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]]
-    about_y = [[cb, 0, sb, 0], [0, 1, 0, 0], [-sb, 0, cb, 0], [0, 0, 0, 1]]
-    x, y = (torch.tensor(matrix, dtype=torch.float64, device="cpu") for matrix in (entries, about_y))
-    return x @ y
+def _parts(row: DHRow) -> tuple[Tensor, Tensor]:
+    """Rz(theta) Tz(d) and Tx(a) Rx(alpha) Ry(beta)."""
+    z, x = (torch.tensor(shift, dtype=torch.float64, device="cpu") for shift in ([0, 0, row.d], [row.a, 0, 0]))
+    turn = roll_pitch_yaw(row.alpha, 0.0, 0.0) @ roll_pitch_yaw(0.0, row.beta, 0.0)
+    return transforms(roll_pitch_yaw(0.0, 0.0, row.theta), z), transforms(turn, x)

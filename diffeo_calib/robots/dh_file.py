@@ -85,9 +85,8 @@ class DHFile:
         rows = [_named(list(map(_what, header)), row) for row in cells]
         said, sure = _conventions(header, rows, [path.stem, *notes])
         if len(said) > 1:
-            raise RobotError.of(
-                f"'{path}' names two conventions", expected="standard or craig (modified), in one place"
-            )
+            expected = "standard or craig (modified), in one place"
+            raise RobotError.of(f"'{path}' names two conventions", expected=expected)
         own = {_what(cell): found[1].lower().replace("°", "deg") for cell in header if (found := UNIT.search(cell))}
         units = _likely_units(rows) | own
         if not units["alpha"] or not units["theta"]:
@@ -110,16 +109,14 @@ class DHFile:
         """
         way = (self.convention if self.sure else convention or self.convention) or convention
         if not way or convention not in (None, way):
-            what, fix = (
-                f"the convention of '{self.path}'",
-                "say it by --dh-convention; `init` finds the one that fits",
-            )
+            what, expected = f"the convention of '{self.path}'", "standard or craig (modified)"
             got = f"{convention}, but the file says {way}" if way else "neither in the file"
-            raise RobotError.of(what, expected="standard or craig (modified)", got=got, fix=fix)
-        if tip not in (None, *self.names):
             raise RobotError.of(
-                f"--tip of '{self.path}'", expected=f"one of {few(self.names, 20)}", got=shown(str(tip))
+                what, expected=expected, got=got, fix="say it by --dh-convention; `init` finds the one that fits"
             )
+        if tip not in (None, *self.names):
+            what, expected = f"--tip of '{self.path}'", f"one of {few(self.names, 20)}"
+            raise RobotError.of(what, expected=expected, got=shown(str(tip)))
         count = len(self.names) if tip is None else self.names.index(tip) + 1
         found = from_dh(self.rows[:count], way, self.names[:count], self.path.stem)
         return Chain(found.name, found.base, tip or found.tip, found.joints)

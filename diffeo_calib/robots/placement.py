@@ -19,11 +19,11 @@ A shift and a turn that have one number are known to as many metres as radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations, product
 from math import sqrt
 from typing import NamedTuple
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
@@ -79,14 +79,11 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     Args:
         poses: (N, P, 4, 4) of the markers' tips [m]. points: (N, P, 3) measured markers [m]; NaN where hidden.
     """
-    sightings = _Sightings.of(poses, points)
-    free = _reduce(sightings, 0.0)
-    turn, _ = _best_rotation(free.factor)
-    base, tool = _place(free, turn)
+    seen, eye = ~points.isnan().any(2), torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    sightings = _Sightings(poses[seen], points[seen], eye.expand(len(points), -1, -1)[seen])
+    base, tool, _ = _solved(sightings, 0.0)
     left = sightings.points - sightings.predicted(tool) @ base[:3, :3].mT - base[:3, 3]
-    problem = _reduce(sightings, float(left.square().sum() / (3 * len(tool))) / PLACES.marker_m**2)
-    turn, iterations = _best_rotation(problem.factor)
-    return Placement(*_place(problem, turn), iterations)
+    return _solved(sightings, float(left.square().sum() / (3 * len(tool))) / PLACES.marker_m**2)
 
 
 def rigid_fit(points: Tensor, targets: Tensor) -> Tensor:
@@ -109,64 +106,42 @@ class _Sightings(NamedTuple):
     points: Tensor  # (S, 3) [m]
     own: Tensor  # (S, P) one in the column of the marker, else zero
 
-    @classmethod
-    def of(cls, poses: Tensor, points: Tensor) -> _Sightings:
-        seen = ~points.isnan().any(2)
-        own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
-        return cls(poses[seen], points[seen], own.expand(len(points), -1, -1)[seen])
-
     def predicted(self, tool: Tensor) -> Tensor:
         """Markers (P, 3) in the robot's base: (S, 3) [m]."""
-        carried = (self.own @ tool)[..., None]
-        return (self.poses[:, :3, :3] @ carried)[..., 0] + self.poses[:, :3, 3]
+        return (self.poses[:, :3, :3] @ (self.own @ tool)[..., None])[..., 0] + self.poses[:, :3, 3]
 
 
-class _Reduced(NamedTuple):
-    """Registration with everything but the rotation eliminated, see :func:`_reduce`."""
+def _solved(sightings: _Sightings, weight: float) -> Placement:
+    """Base and markers; ``weight`` of the sum of the squared norms of the markers.
 
-    factor: Tensor  # (10, 10) or fewer rows: |factor [vec B; -1]|^2 is the sum of squares
-    by_turn: Tensor  # (3 S + 3 P, 9) and
-    fixed: Tensor  # (3 S + 3 P,): left-hand side by_turn vec(B) - fixed, centred, and zeros for the prior
-    tool_inverse: Tensor  # (3 P, 3 S + 3 P) pseudo-inverse for the markers
-    sightings: _Sightings
-    centre: Tensor  # (3,) mean of the points [m]
-
-
-def _reduce(sightings: _Sightings, weight: float) -> _Reduced:
-    """Eliminate markers and translation from  B (y_ik - y0) - t_ik = R_ik c_k + s,  B the inverse base rotation."""
+    B (y_ik - y0) - t_ik = R_ik c_k + s, B the inverse base rotation, is linear in vec B, c, s. Centring eliminates s,
+    a projection c, and a QR factor represents the rest without normal equations. Where the poses leave the markers
+    undetermined (a planar arm, a tool that never turns), the markers of smallest norm are taken and the base accounts
+    for the difference.
+    """
     poses, points, own = sightings
     S, P = own.shape
-    centre = points.mean(0)
-    eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    by_turn = torch.einsum("ac,sb->sacb", eye, points - centre).reshape(S, 3, 9)
-    fixed = poses[:, :3, 3]
+    centre, eye = points.mean(0), torch.eye(3 * P, dtype=points.dtype, device=points.device)
+    by_turn = torch.einsum("ac,sb->sacb", eye[:3, :3], points - centre).reshape(S, 3, 9)
     by_tool = torch.einsum("sab,sl->salb", poses[:, :3, :3], own).reshape(S, 3, 3 * P)
-    by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
-    small = sqrt(weight) * torch.eye(3 * P, dtype=points.dtype, device=points.device)
-    by_tool, by_turn = torch.cat([by_tool, small]), torch.cat([by_turn, by_turn.new_zeros(3 * P, 9)])
-    fixed = torch.cat([fixed, fixed.new_zeros(3 * P)])
-    U, s, Vt = torch.linalg.svd(by_tool, full_matrices=False)
+    parts = (by_turn, poses[:, :3, 3:], by_tool)
+    by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in parts)
+    both = torch.cat([torch.cat([by_turn, fixed], 1), eye.new_zeros(3 * P, 10)])
+    U, s, Vt = torch.linalg.svd(torch.cat([by_tool, sqrt(weight) * eye]), full_matrices=False)
     kept = s > UNDETERMINED_MOTION_M * sqrt(S / P)
     U, s, Vt = U[:, kept], s[kept], Vt[kept]
-    both = torch.cat([by_turn, fixed[:, None]], dim=1)
-    factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R
-    return _Reduced(factor, by_turn, fixed, (Vt.mT / s) @ U.mT, sightings, centre)
-
-
-def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
-    """Base (4, 4) and markers (P, 3) that belong to the inverse base rotation B (3, 3)."""
-    tool = (problem.tool_inverse @ (problem.by_turn @ B.flatten() - problem.fixed)).reshape(-1, 3)
-    base = torch.eye(4, dtype=B.dtype, device=B.device)
-    base[:3, :3] = B.mT
-    base[:3, 3] = problem.centre - B.mT @ problem.sightings.predicted(tool).mean(dim=0)
-    return base, tool
+    factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R  # |factor [vec B; -1]|^2 is the sum of squares
+    B, iterations = _best_rotation(factor)
+    tool = ((Vt.mT / s) @ (U.mT @ (both[:, :9] @ B.flatten() - both[:, 9]))).reshape(-1, 3)
+    base = transforms(B.mT, centre - B.mT @ sightings.predicted(tool).mean(dim=0))
+    return Placement(base, tool, iterations)
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
     """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps."""
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
-    B = torch.cat([nearest_rotations(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)
+    B = torch.cat([nearest_rotations(linear)[None], factor.new_tensor(Rotation.create_group("O").as_matrix())])
     eye = torch.eye(3, dtype=factor.dtype, device=factor.device)
     generators = skew(eye)  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
     pairs = generators[:, None] @ generators
@@ -190,12 +165,3 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
         if float(delta[loss.argmin()].norm()) < CONVERGED_TURN_RAD:
             return B[loss.argmin()], step + 1
     return B[loss.argmin()], MAX_ITERATIONS
-
-
-def _cube_rotations(device: torch.device) -> Tensor:
-    """The 24 rotations of the cube (24, 3, 3)."""
-    eye = torch.eye(3, dtype=torch.float64, device=device)
-    orders = torch.tensor(list(permutations(range(3))), dtype=torch.int64, device=device)
-    signs = torch.tensor(list(product((1.0, -1.0), repeat=3)), dtype=torch.float64, device=device)
-    signed = (eye[orders][:, None] * signs[:, None]).flatten(0, 1)  # (48, 3, 3)
-    return signed[torch.linalg.det(signed) > 0]

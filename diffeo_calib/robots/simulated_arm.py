@@ -40,7 +40,7 @@ TWIST_DEVIATION = 5e-4
 """Standard deviation of geometric errors: 0.5 mm and 0.5 mrad."""
 TRANSMISSION_RANGE = (1e-4, 3e-4)
 """Amplitudes of each harmonic of a joint's transmission error [rad]."""
-HIGHER_HARMONICS = (3, 7)
+HARMONICS, HIGHER_HARMONICS = 3, (3, 7)
 """The third harmonic is drawn from this half-open range (waves per turn)."""
 COMPLIANCE = (3.0e-6, 4.0e-6, 6.0e-6, 2.5e-5, 3.0e-5, 4.0e-5)
 """Joint compliances [rad/(N m)]: stiffness 2.5e5 N m/rad at the shoulder, 2.5e4 at the wrist, usual for such gears."""
@@ -96,8 +96,7 @@ class SimulatedArm:
         self.noise, self.payload = noise, payload
         self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
         self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)
-        self._waves = _draw_waves(np.random.default_rng([seed, 1]), self.nominal.n, transmission)
-        self._lines = _draw_lines(np.random.default_rng([seed, 5]), self.nominal.n, lines)
+        self._waves = _draw_waves(seed, self.nominal.n, transmission, lines)
         self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64, device="cpu")
         self._masses, self._centres = _loads(self.nominal)
 
@@ -156,10 +155,9 @@ class SimulatedArm:
         Args:
             joint: its number. factor: of the amplitudes of all its harmonics.
         """
-        other, (harmonics, amplitudes, phases) = copy(self), self._waves
-        grown = torch.ones(len(amplitudes), 1, dtype=amplitudes.dtype, device=amplitudes.device)
-        grown[joint] = factor
-        other._waves = harmonics, amplitudes * grown, phases
+        other, (joints, frequencies, amplitudes, phases) = copy(self), self._waves
+        grown = (joints == joint) & (torch.arange(len(joints), device=joints.device) < HARMONICS * self.nominal.n)
+        other._waves = joints, frequencies, torch.where(grown, factor * amplitudes, amplitudes), phases
         return other
 
     def write_urdf(self, path: str | PathLike[str]) -> None:
@@ -167,11 +165,8 @@ class SimulatedArm:
         write_whole(path, URDF_FILE.read_bytes())
 
     def _transmission(self, q: Tensor) -> Tensor:
-        harmonics, amplitudes, phases = (part.to(q.device) for part in self._waves)
-        joints, frequencies, heights, shifts = (part.to(q.device) for part in self._lines)
-        lines = heights * torch.sin(frequencies * q[..., joints] + shifts)
-        smooth = (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
-        return smooth.index_add(-1, joints, lines)
+        joints, frequencies, amplitudes, phases = (part.to(q.device) for part in self._waves)
+        return torch.zeros_like(q).index_add(-1, joints, amplitudes * torch.sin(frequencies * q[..., joints] + phases))
 
     def _gravity_sag(self, q: Tensor, payload: Tensor | float | None = None) -> Tensor:
         return self._compliance.to(q.device) * self.gravity_torques(q, payload)
@@ -190,26 +185,24 @@ def _draw_geometry(chain: Tree, rng: np.random.Generator, markers: int, factor: 
     return placed, placed.absorb(theta)
 
 
-def _draw_waves(rng: np.random.Generator, n: int, factor: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Harmonics, amplitudes [rad] and phases [rad] of the transmission errors, (n, 3) each."""
-    harmonics = np.column_stack([np.ones(n), np.full(n, 2), rng.integers(*HIGHER_HARMONICS, n)])
-    amplitudes = factor * rng.uniform(*TRANSMISSION_RANGE, (n, 3))
-    return torch.from_numpy(harmonics), torch.from_numpy(amplitudes), torch.from_numpy(rng.uniform(0, 2 * pi, (n, 3)))
-
-
-def _draw_lines(
-    rng: np.random.Generator, n: int, lines: Sequence[tuple[int, float, float]]
+def _draw_waves(
+    seed: int, n: int, factor: float, lines: Sequence[tuple[int, float, float]]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Joints, waves per turn, amplitudes [rad] and phases [rad] of the gear lines, (K,) each."""
+    """Joints, waves per turn, amplitudes and phases [rad] of transmission errors, (K,) each: harmonics, then lines."""
     for joint, frequency, amplitude in lines:
         if not (joint in range(n) and frequency > 0 and amplitude >= 0):
             expected = f"joint numbers from 0 to {n - 1}, positive frequencies, amplitudes of 0 or more"
             raise InputError.of("`lines` of the simulated arm", expected=expected, got=(joint, frequency, amplitude))
-    joints = torch.tensor([joint for joint, _, _ in lines], dtype=torch.int64, device="cpu")
-    numbers = np.array([line[1:] for line in lines], dtype=np.float64).reshape(-1, 2)
-    phases = rng.uniform(0, 2 * pi, len(lines))
-    frequencies, amplitudes = (torch.from_numpy(column.copy()) for column in numbers.T)
-    return joints, frequencies, amplitudes, torch.from_numpy(phases)
+    rng, of_lines = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 5])
+    harmonics = np.column_stack([np.ones(n), np.full(n, 2), rng.integers(*HIGHER_HARMONICS, n)])
+    amplitudes = factor * rng.uniform(*TRANSMISSION_RANGE, (n, HARMONICS))
+    phases = np.append(rng.uniform(0, 2 * pi, (n, HARMONICS)), of_lines.uniform(0, 2 * pi, len(lines)))
+    joints = [*np.repeat(np.arange(n), HARMONICS).tolist(), *(joint for joint, _, _ in lines)]
+    numbers = np.concatenate(
+        [np.stack([harmonics, amplitudes]).reshape(2, -1), np.array(lines).reshape(-1, 3).T[1:]], 1
+    )
+    found = (torch.from_numpy(part.copy()) for part in (*numbers, phases))
+    return torch.tensor(joints, dtype=torch.int64, device="cpu"), *found
 
 
 def _loads(chain: Tree) -> tuple[Tensor, Tensor]:

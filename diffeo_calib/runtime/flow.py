@@ -156,17 +156,10 @@ class Operations(NamedTuple):
     inverse: Callable[[Any], Any]
 
 
-def _profile(name: str, r2: Array) -> Array:
-    return next(PROFILES[name](r2))
-
-
-def _at_least(values: Array, floor: float) -> Array:
-    return np.maximum(values, floor, out=values)
-
-
 NUMPY = Operations(
     *(np.sin, np.cos, within_turn, np.stack, np.concatenate, np.ones_like, np.broadcast_to),
-    *(_at_least, _profile, cells_around, combined, transforms, np.linalg.inv),
+    *(lambda values, floor: np.maximum(values, floor, out=values), lambda name, r2: next(PROFILES[name](r2))),
+    *(cells_around, combined, transforms, np.linalg.inv),
 )
 
 

@@ -48,9 +48,7 @@ def cauchy(r2: Array) -> Iterator[Array]:
 
 def constant(r2: Array) -> Iterator[Array]:
     """1: the same motion everywhere."""
-    yield np.ones_like(r2)
-    yield np.zeros_like(r2)
-    yield np.zeros_like(r2)
+    yield from (np.ones_like(r2), np.zeros_like(r2), np.zeros_like(r2))
 
 
 def matern(r2: Array, *, order: int) -> Iterator[Array]:
@@ -62,21 +60,19 @@ def matern(r2: Array, *, order: int) -> Iterator[Array]:
     c, factor = 2.0 * order + 1.0, 1.0
     r = np.sqrt(np.maximum(r2, 0.0) * c)
     decay = np.exp(-r)
-    for k in range(3):
-        yield factor * _polynomial(r, order - k) * decay
-        factor *= -0.5 * c / max(2 * (order - k) - 1, 1)
+    for k in range(order, order - 3, -1):
+        yield factor * MATERN[k](r) * decay
+        factor *= -0.5 * c / max(2 * k - 1, 1)
 
 
-def _polynomial(r: Array, order: int) -> Array:
-    """kappa_order exp(r)."""
-    if order == 3:
-        return 1.0 + r * (1.0 + r * (0.4 + r / 15.0))
-    if order == 2:
-        return 1.0 + r * (1.0 + r / 3.0)
-    if order == 1:
-        return 1.0 + r
-    return np.ones_like(r) if order == 0 else 1.0 / np.maximum(r, SMALLEST_RADIUS)
-
+MATERN: dict[int, Callable[[Array], Array]] = {
+    3: lambda r: 1.0 + r * (1.0 + r * (0.4 + r / 15.0)),
+    2: lambda r: 1.0 + r * (1.0 + r / 3.0),
+    1: lambda r: 1.0 + r,
+    0: np.ones_like,
+    -1: lambda r: 1.0 / np.maximum(r, SMALLEST_RADIUS),
+}
+"""kappa_k exp(r)."""
 
 PROFILES: dict[str, Callable[[Array], Iterator[Array]]] = {
     "gaussian": gaussian,
@@ -87,7 +83,6 @@ PROFILES: dict[str, Callable[[Array], Iterator[Array]]] = {
     "matern72": partial(matern, order=3),
 }
 """All profiles by their names in model files: kappa at r2, and on request its first two derivatives in r2."""
-
 
 TOLERANCE = 1e-13
 """Largest error of a table, rad; for fields above 1 rad relative to the largest."""
@@ -223,24 +218,11 @@ def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
         wrong = np.abs(_quintic(c, u) - _derivatives(sums, middles)[:, 0]) > limit
         if len(knots) + int(wrong.sum()) > MOST_CELLS:
             return None
-        cells = np.flatnonzero(open_cells)[wrong]
-        knots, values, open_cells = _split(sums, knots, values, cells)
+        cells = np.flatnonzero(open_cells)[wrong]  # to be halved
+        knots, halves = np.insert(knots, cells + 1, middles[wrong]), cells + np.arange(len(cells))
+        values = np.insert(values, cells + 1, _derivatives(sums, middles[wrong]), axis=0)
+        open_cells = np.isin(np.arange(len(knots) - 1), [halves, halves + 1])
     return Table(knots, values)
-
-
-def _split(
-    sums: Sequence[PeriodicSum], knots: Array, values: Array, cells: np.ndarray
-) -> tuple[Array, Array, np.ndarray]:
-    """Halve these cells: new knots, values, and which cells are halves."""
-    middles = 0.5 * (knots[cells] + knots[cells + 1])
-    halves = np.zeros(len(knots) - 1 + len(cells), dtype=bool)
-    at = cells + np.arange(len(cells))  # numbers of the left halves
-    halves[at], halves[at + 1] = True, True
-    return (
-        np.insert(knots, cells + 1, middles),
-        np.insert(values, cells + 1, _derivatives(sums, middles), axis=0),
-        halves,
-    )
 
 
 def _derivatives(sums: Sequence[PeriodicSum], x: Array) -> Array:
