@@ -23,11 +23,12 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import check_units, in_unit, origin_numbers, table_text
-from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.interop.rigid import geometry_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import checked_tip
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 
 PARALLEL_SINE = 0.05
@@ -73,15 +74,13 @@ def dh_table(
     """
     if convention not in CONVENTIONS:
         raise InputError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
-    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+    geometry = geometry_of(kinematics)
     chain = geometry.chain
     path, frames, end = zero_frames(geometry, tip)
     numbers, start, after = links(frames, chain.axes[path], end, torch.eye(4, dtype=torch.float64, device=HOST))
     moving = [joint for joint in chain.joints if joint.kind != "fixed"]
-    joints = [moving[number] for number in path]
-    names = [joint.name for joint in joints]
-    elsewhere = [joint.name for joint in joints if not set(joint.mimic or ()) <= set(names)]
-    if elsewhere:
+    joints, names = [moving[number] for number in path], [moving[number].name for number in path]
+    if elsewhere := [joint.name for joint in joints if not set(joint.mimic or ()) <= set(names)]:
         what = f"{', '.join(elsewhere)}: driven by joints that are not on the path to the tip"
         raise InputError.of(what, expected="joints that follow one another", fix="export a URDF, C, torch or ONNX")
     rows = [
@@ -144,43 +143,37 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
 def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], list[Tensor], Tensor]:
     """The moving joints on the path to a tip, their frames, errors included, and that of the tip, all joints at zero.
 
-    Frames are in the robot's base. ``tip`` is named for a robot with several.
-
-    Raises InputError: no such tip, or none named.
+    Frames are in the robot's base. ``tip`` is named for a robot with several. Raises InputError: no such tip, or none.
     """
     chain = geometry.chain
     name = checked_tip(chain, tip)
     path = chain.path_to(name).tolist()
-    frame, frames = torch.eye(4, dtype=torch.float64, device=HOST), []
+    frames = [torch.eye(4, dtype=torch.float64, device=HOST)]
     for joint in path:
-        frame = frame @ chain.offsets[joint] @ geometry.joint_errors[joint]
-        frames.append(frame)
-    return path, frames, frame @ chain.tip_offsets[chain.tips.index(name)]
+        frames.append(frames[-1] @ chain.offsets[joint] @ geometry.joint_errors[joint])
+    return path, frames[1:], frames[-1] @ chain.tip_offsets[chain.tips.index(name)]
 
 
 def links(
     frames: Sequence[Tensor], axes: Tensor, tip: Tensor, start: Tensor
 ) -> tuple[list[DHRow], Tensor, list[Tensor]]:
-    """Standard parameters of each joint, all at zero.
+    """Standard parameters of each joint, all at zero: n rows; the frame before the first; the frames after each.
 
     Args:
         frames: n frames of the joints (4, 4) [m]. axes: (n, 3) their axes. tip: (4, 4) frame of the tip.
         start: (4, 4); the first frame is on the first axis, next to it, with its x axis turned as little as possible.
-
-    Returns n rows; the frame before the first; the frames after each.
     """
     lines = [(frame[:3, :3] @ axis, frame[:3, 3]) for frame, axis in zip(frames, axes, strict=True)]
     before = at = on_axis(start, *lines[0])
     rows, after = [], []
-    for line in lines[1:]:
-        rows.append(_link(at, *line))
-        at = at @ row_transform(rows[-1])
+    for line in [*lines[1:], (tip[:3, 2], tip[:3, 3])]:
+        row = _link(at, *line)
+        if len(rows) == len(lines) - 1 and float(torch.linalg.cross(at[:3, 2], line[0]).norm()) <= PARALLEL_SINE:
+            row = DHRow(0.0, 0.0, float(at[:3, 2] @ (line[1] - at[:3, 3])))  # the tool takes the rest
+        at = at @ row_transform(row)
+        rows.append(row)
         after.append(at)
-    if float(torch.linalg.cross(at[:3, 2], tip[:3, 2]).norm()) > PARALLEL_SINE:
-        last = _link(at, tip[:3, 2], tip[:3, 3])
-    else:  # the tool takes the rest
-        last = DHRow(0.0, 0.0, float(at[:3, 2] @ (tip[:3, 3] - at[:3, 3])))
-    return [*rows, last], before, [*after, at @ row_transform(last)]
+    return rows, before, after
 
 
 def _link(at: Tensor, direction: Tensor, point: Tensor) -> DHRow:
@@ -188,13 +181,10 @@ def _link(at: Tensor, direction: Tensor, point: Tensor) -> DHRow:
     R = at[:3, :3]
     u, v, w = (R.mT @ direction).tolist()
     x, y, z = (R.mT @ (point - at[:3, 3])).tolist()
-    sine = hypot(u, v)
-    if sine > PARALLEL_SINE:
+    if hypot(u, v) > PARALLEL_SINE:
         theta = _forward(-v, u)  # along the common normal
-        rotated = _turned(u, v, -theta), _turned(x, y, -theta)
-        (_, v), (a, y) = rotated
-        alpha = atan2(-v, w)
-        return DHRow(a, alpha, z - y * w / v, theta)
+        (_, v), (a, y) = _turned(u, v, -theta), _turned(x, y, -theta)
+        return DHRow(a, atan2(-v, w), z - y * w / v, theta)
     foot_x, foot_y = x - z / w * u, y - z / w * v  # the next axis in the plane z = 0
     theta = _forward(foot_x, foot_y) if hypot(foot_x, foot_y) > COINCIDENT_AXES_M else 0.0
     (a, _), (u, v) = _turned(foot_x, foot_y, -theta), _turned(u, v, -theta)
@@ -206,10 +196,8 @@ def on_axis(start: Tensor, direction: Tensor, point: Tensor) -> Tensor:
     origin = point + direction * (direction @ (start[:3, 3] - point))
     x, y = (a - direction * (direction @ a) for a in (start[:3, 0], start[:3, 1]))
     x = x if float(x.norm()) > SHORT_PROJECTION else torch.linalg.cross(y, direction)
-    frame = torch.eye(4, dtype=torch.float64, device=HOST)
     x = x / x.norm()
-    frame[:3] = torch.stack([x, torch.linalg.cross(direction, x), direction, origin], dim=1)
-    return frame
+    return transforms(torch.stack([x, torch.linalg.cross(direction, x), direction], 1), origin)
 
 
 def _forward(x: float, y: float) -> float:

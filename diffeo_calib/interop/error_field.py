@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from math import prod
 
 import torch
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop.files import LENGTHS, table_text
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import compensate
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import SLIDES, is_cartesian
 
 MOST_POINTS = 100_000
@@ -35,11 +33,9 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     if not is_cartesian(robot):
         fix = "calibrate with --robot-pose, or correct a program with `correct`"
         raise InputError.of("an error field", expected="a machine with commanded places", got=robot.name, fix=fix)
-    if len(counts) != axes or min(counts) < 2:
-        expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}"
+    if len(counts) != axes or min(counts) < 2 or prod(counts) > MOST_POINTS:
+        expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}, at most {MOST_POINTS} points"
         raise InputError.of(f"--grid {grid}", expected=expected)
-    if (points := prod(counts)) > MOST_POINTS:
-        raise InputError.of(f"--grid {grid}", expected=f"at most {MOST_POINTS} points", got=points)
     fitted = model.configurations
     ends = zip(fitted.amin(0)[:axes].tolist(), fitted.amax(0)[:axes].tolist(), counts, strict=True)
     lines = [torch.linspace(*each, dtype=fitted.dtype, device=fitted.device) for each in ends]
@@ -50,9 +46,6 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     base = model.geometry.base[:3, :3]
     known = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
     deviations = known.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
-    cells = UNITS_PER_METRE[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
-    text = io.StringIO(newline="")
-    sheet = csv.writer(text)
-    sheet.writerow([f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]])
-    sheet.writerows(cells.round(decimals=DIGITS).tolist())
-    return text.getvalue()
+    cells = LENGTHS[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
+    header = [f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]]
+    return table_text(header, cells.round(decimals=DIGITS).tolist())

@@ -58,12 +58,10 @@ def correction_tables(
 
     Raises InputError: a step that is not positive, or tables of more than 100,000 rows.
     """
-    check_number(turn_step, "`turn_step`", above=0.0)
-    check_number(slide_step, "`slide_step`", above=0.0)
-    return [
-        _table(model, index, turn_step if turns else slide_step, turns)
-        for index, turns in enumerate(model.robot.periodic)
-    ]
+    for name, step in (("`turn_step`", turn_step), ("`slide_step`", slide_step)):
+        check_number(step, name, above=0.0)
+    steps = [(turn_step if turns else slide_step, turns) for turns in model.robot.periodic]
+    return [_table(model, index, *step) for index, step in enumerate(steps)]
 
 
 def write_correction_tables(
@@ -99,31 +97,27 @@ def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> s
     rows: list[list[object]] = []
     for table in tables:
         unit = angle if table.turns else length
-        columns = (table.values, table.errors, table.corrections)
-        numbers = zip(*(in_unit(column.tolist(), unit) for column in columns), strict=True)
-        rows += [[table.joint, unit, *row] for row in numbers]
+        columns = (in_unit(column.tolist(), unit) for column in (table.values, table.errors, table.corrections))
+        rows += [[table.joint, unit, *row] for row in zip(*columns, strict=True)]
     return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
 
 
 def offsets_text(found: JointOffsets, robot: Tree, length: str, angle: str) -> str:
     """Joint offsets as CSV; see :func:`write_joint_offsets`."""
     units = [angle if turns else length for turns in robot.periodic]
-    rows = [
-        [name, unit, *in_unit([offset], unit)]
-        for name, unit, offset in zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
-    ]
+    each = zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
+    rows = [[name, unit, *in_unit([offset], unit)] for name, unit, offset in each]
     return table_text(["joint", "unit", "offset_to_add_to_reading"], rows)
 
 
 def _table(model: CalibratedKinematics, index: int, step: float, turns: bool) -> CorrectionTable:
-    joint = model.robot.joint_names[index]
-    low, high = (float(end) for end in model.configurations[:, index].aminmax())
+    joint, measured = model.robot.joint_names[index], model.configurations[:, index]
+    low, high = (float(end) for end in measured.aminmax())
     count = max(ceil((high - low) / step), 1)
     if count > MOST_ROWS:
-        what, fix = f"the table of '{joint}' has {count} rows", "take a larger step"
-        raise InputError.of(what, expected=f"at most {MOST_ROWS}", fix=fix)
-    device = model.configurations.device
-    q = torch.linspace(low, high, 2 * count + 1, dtype=torch.float64, device=device)  # rows, and points between them
+        what = f"the table of '{joint}' has {count} rows"
+        raise InputError.of(what, expected=f"at most {MOST_ROWS}", fix="take a larger step")
+    q = torch.linspace(low, high, 2 * count + 1, dtype=torch.float64, device=measured.device)  # and points between rows
     correction = torch.zeros_like(q)
     for _ in range(FIXED_POINT_STEPS):
         correction = -model.transmission(joint, q + correction)

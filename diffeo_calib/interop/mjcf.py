@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.interop.rigid import geometry_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
@@ -46,8 +46,7 @@ def write_mjcf(kinematics: CalibratedKinematics | Geometry, path: str | PathLike
     Raises InputError: a base that is not above all other links, a mimic joint that several joints drive, or one that is
     not in the chain, or the file cannot be written. RobotError: masses or inertias in the URDF that are no numbers.
     """
-    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
-    write_whole(path, mjcf_text(geometry).encode())
+    write_whole(path, mjcf_text(geometry_of(kinematics)).encode())
 
 
 def mjcf_text(geometry: Geometry) -> str:

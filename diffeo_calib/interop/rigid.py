@@ -97,6 +97,11 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
     return on.compared(candidates[how], how, validated)
 
 
+def geometry_of(kinematics: CalibratedKinematics | Geometry) -> Geometry:
+    """The best rigid kinematics of a calibrated model; a geometry as it is."""
+    return kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+
+
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
     return _with_errors(model, None, "nominal kinematics", transmission=transmission)

@@ -25,7 +25,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
 from diffeo_calib.common.files import read_regular, write_whole
 from diffeo_calib.interop.files import origin_numbers
-from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.interop.rigid import geometry_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -55,9 +55,8 @@ def write_urdf(
     Raises InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
     RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
     """
-    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
-    content = corrected_urdf(geometry, urdf_of(geometry.chain, robot))
-    write_whole(path, content)
+    geometry = geometry_of(kinematics)
+    write_whole(path, corrected_urdf(geometry, urdf_of(geometry.chain, robot)))
 
 
 def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
