@@ -39,80 +39,60 @@ def camera_files(
         if cameras:
             lens = cameras[name.partition("/")[0] if name not in cameras else name].camera
             files = {"camera.yaml": camera_text(lens), "camera_info.yaml": camera_text(lens, ros=True)}
-        files |= {
-            "hand_eye.yaml": _hand_eye(own),
-            "easy_handeye2.calib": _easy_handeye(own, known, model.geometry.on[0], on_tool=on_tool),
-            "camera.xacro": _joint(own, known),
-            "static_transform.launch.xml": _launch(own, known),
-        }
+        files |= {"hand_eye.yaml": _hand_eye(own)} | _of_ros(own, known, model.geometry.on[0], on_tool=on_tool)
         found |= {file if len(each) == 1 else f"{known}_{file}": text for file, text in files.items()}
     return found
-
-
-def _easy_handeye(own: HandEye, name: str, tip: str, *, on_tool: bool) -> str:
-    """A calibration of easy_handeye2: where the camera is, on the effector or in the robot's base."""
-    base = own.board.link if on_tool else own.camera.link
-    named = {
-        "name": name,
-        "calibration_type": "eye_in_hand" if on_tool else "eye_on_base",
-        "robot_base_frame": base,
-        "robot_effector_frame": tip,
-        "tracking_base_frame": f"{name}{FRAME}",
-        "tracking_marker_frame": "board",
-    }
-    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
-    parts = {
-        "translation": zip("xyz", own.camera.pose[:3, 3].tolist(), strict=True),
-        "rotation": zip("xyzw", turn, strict=True),
-    }
-    lines = [
-        "parameters:",
-        *(f'  {key}: "{value}"' for key, value in named.items()),
-        "  freehand_robot_movement: false",
-    ]
-    lines += ["transform:"]
-    for part, numbers in parts.items():
-        lines += [f"  {part}:", *(f"    {axis}: {value!r}" for axis, value in numbers)]
-    return "\n".join([*lines, ""])
 
 
 def _hand_eye(own: HandEye) -> str:
     """Camera and board as OpenCV's `FileStorage` reads them: R, t as of `calibrateHandEye`."""
     lines = ["%YAML:1.0", "---", f'camera_parent: "{own.camera.link}"']
     for name, fixed in vars(own).items():
-        for part, rows, values in (
-            ("R", 3, fixed.pose[:3, :3]),
-            ("t", 3, fixed.pose[:3, 3]),
-            ("covariance", 6, fixed.covariance),  # of shift, m, and turn, rad
-        ):
+        R, t = fixed.pose[:3, :3], fixed.pose[:3, 3]
+        for part, rows, values in (("R", 3, R), ("t", 3, t), ("covariance", 6, fixed.covariance)):  # of shift, turn
             lines += matrix_lines(f"{name}_{part}", rows, values.flatten().tolist())
     return "\n".join([*lines, ""])
 
 
-def _joint(own: HandEye, name: str) -> str:
-    """A link and a fixed joint, to include in a xacro file of the robot."""
-    xyz, rpy = (" ".join(f"{value!r}" for value in part) for part in origin_numbers(own.camera.pose))
-    frame = quoteattr(f"{name}{FRAME}")
-    return f"""<?xml version="1.0"?>
+def _of_ros(own: HandEye, name: str, tip: str, *, on_tool: bool) -> dict[str, str]:
+    """A calibration of easy_handeye2, a link and joint for xacro, a launch file of ROS 2 that publishes the frame."""
+    frame, parent, shift = f"{name}{FRAME}", own.camera.link, own.camera.pose[:3, 3].tolist()
+    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
+    translation, quaternion = (
+        "\n".join(f"    {axis}: {value!r}" for axis, value in zip(axes, numbers, strict=True))
+        for axes, numbers in (("xyz", shift), ("xyzw", turn))
+    )
+    named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*shift, *turn], strict=True)
+    words = [f"--{entry} {value!r}" for entry, value in named]
+    words += [f"--frame-id {parent}", f"--child-frame-id {frame}"]
+    xyz, rpy = (" ".join(map(repr, part)) for part in origin_numbers(own.camera.pose))
+    return {
+        "easy_handeye2.calib": f"""parameters:
+  name: "{name}"
+  calibration_type: "{"eye_in_hand" if on_tool else "eye_on_base"}"
+  robot_base_frame: "{own.board.link if on_tool else parent}"
+  robot_effector_frame: "{tip}"
+  tracking_base_frame: "{frame}"
+  tracking_marker_frame: "board"
+  freehand_robot_movement: false
+transform:
+  translation:
+{translation}
+  rotation:
+{quaternion}
+""",
+        "camera.xacro": f"""<?xml version="1.0"?>
 <robot xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <link name={frame}/>
+  <link name={quoteattr(frame)}/>
   <joint name={quoteattr(f"{name}_joint")} type="fixed">
-    <parent link={quoteattr(own.camera.link)}/>
-    <child link={frame}/>
+    <parent link={quoteattr(parent)}/>
+    <child link={quoteattr(frame)}/>
     <origin xyz="{xyz}" rpy="{rpy}"/>
   </joint>
 </robot>
-"""
-
-
-def _launch(own: HandEye, name: str) -> str:
-    """A launch file of ROS 2 that publishes the camera's frame."""
-    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
-    numbers = [*own.camera.pose[:3, 3].tolist(), *turn]
-    named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)
-    words = [*(f"--{name} {value!r}" for name, value in named), f"--frame-id {own.camera.link}"]
-    arguments = quoteattr(" ".join([*words, f"--child-frame-id {name}{FRAME}"]))
-    return f"""<launch>
-  <node pkg="tf2_ros" exec="static_transform_publisher" name="camera_transform" args={arguments}/>
+""",
+        "static_transform.launch.xml": f"""<launch>
+  <node pkg="tf2_ros" exec="static_transform_publisher" name="camera_transform" args={quoteattr(" ".join(words))}/>
 </launch>
-"""
+""",
+    }

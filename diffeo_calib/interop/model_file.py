@@ -19,8 +19,8 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, printable
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.container import ENTRY, UNSOUND, Header, digest, read_arrays
-from diffeo_calib.interop.model_header import KernelClasses, MissingArgumentError, Tensors, describe, rebuild
+from diffeo_calib.interop.container import ENTRY, UNSOUND, digest, read_arrays
+from diffeo_calib.interop.model_header import KernelClasses, MissingArgumentError, describe, rebuild
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.profiles import Profile, check_profile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -74,8 +74,7 @@ def load(
         DiffeoCalibWarning: devices of a kind that nobody registered here, whose readings are not predicted; a profile
             in a file of an old version, which cannot be compared with the one passed.
     """
-    known = _checked(kernels)
-    header, tensors = read(Path(path))
+    known, (header, tensors) = _checked(kernels), read(Path(path))
     try:
         model = rebuild(header, tensors, nominal, known)
     except (ModelFileError, MissingArgumentError):
@@ -90,16 +89,14 @@ def load(
 
 def _checked(kernels: object) -> KernelClasses:
     """Classes of kernels, and profiles whose derivatives are right, of classes without arguments, by their names."""
-    if kernels is None:
-        return {}
-    given = dict(kernels) if isinstance(kernels, Mapping) else {"": None}
-    if not all(isinstance(one, Profile) or _is_class(one, (Kernel, Profile)) for one in given.values()):
-        fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}, or {'my_profile': MyProfile(2.5)}"
-        expected = "names -> subclasses of dc.Kernel, or profiles"
-        raise InputError.of("`kernels`", expected=expected, got=as_written(kernels)[:80], fix=fix)
+    given = {} if kernels is None else dict(kernels) if isinstance(kernels, Mapping) else {"": None}
     for name, one in given.items():
-        if _is_class(one, Kernel):
+        if isinstance(one, type) and issubclass(one, Kernel):
             continue
+        if not (isinstance(one, Profile) or (isinstance(one, type) and issubclass(one, Profile))):
+            fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}, or {'my_profile': MyProfile(2.5)}"
+            expected = "names -> subclasses of dc.Kernel, or profiles"
+            raise InputError.of("`kernels`", expected=expected, got=as_written(kernels)[:80], fix=fix)
         try:
             given[name] = one() if isinstance(one, type) else one
         except TypeError as error:
@@ -109,14 +106,7 @@ def _checked(kernels: object) -> KernelClasses:
     return given
 
 
-def _is_class(given: object, kinds: type | tuple[type, ...]) -> bool:
-    return isinstance(given, type) and issubclass(given, kinds)
-
-
 def read(path: Path) -> tuple[Header, Tensors]:
-    """Header and tensors of a file, after checking its format and checksum.
-
-    Raises ModelFileError: the file cannot be read, or has another format or a wrong checksum.
-    """
+    """Header and tensors of a file, after checking its format and checksum; ModelFileError as :func:`read_arrays`."""
     header, arrays = read_arrays(path)
     return header, {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}

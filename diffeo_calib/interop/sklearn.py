@@ -76,21 +76,21 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Raises InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
         """
-        if not isinstance(self.robot, Tree):
-            fix = "pass robot=dc.load_urdf(...) to the constructor"
-            raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
         robot = self.robot
+        if not isinstance(robot, Tree):
+            fix = "pass robot=dc.load_urdf(...) to the constructor"
+            raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__, fix=fix)
         if isinstance(y, RowGroups):
             q, data = self._in_order(robot, validate_data(self, X, dtype=np.float64)), y
             if not np.array_equal(q, y.q.numpy()):
                 raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
         else:
-            hidden = _hidden(y)
-            known: Any = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
+            values = np.asarray(y)
+            hidden = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
+            known: Any = np.where(hidden, 0.0, values) if hidden.any() and not hidden.all() else y
             checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
             points = np.array(checked[1], dtype=np.float64).reshape(len(checked[1]), -1)
-            if hidden is not None:
-                points[hidden.reshape(points.shape)] = np.nan
+            points[hidden.reshape(points.shape)] = np.nan
             data = self._measured(robot, self._in_order(robot, checked[0]), points)
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
         self.result_ = calibrate(robot, data, **chosen)
@@ -109,8 +109,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.lever is None:
             return Measurements(q, points.reshape(len(q), -1, 3), robot.joint_names, on=self.on)
         marks = torch.from_numpy(points.reshape(-1, POINTS, 3))
-        poses = marks.new_full((len(marks), 4, 4), torch.nan)
-        seen = ~marks.isnan().any((1, 2))
+        poses, seen = marks.new_full((len(marks), 4, 4), torch.nan), ~marks.isnan().any((1, 2))
         poses[seen] = poses_from_marks(marks[seen], self.lever)
         poses = poses.unflatten(0, (len(q), -1))
         poses = poses[:, 0] if poses.shape[1] == 1 else poses
@@ -153,10 +152,3 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if q.shape[1] != len(wanted):
             raise MeasurementError.of("`X`", expected=f"{len(wanted)} joints", got=f"{q.shape[1]} columns")
         return q if names is None else q[:, [list(names).index(name) for name in wanted]]
-
-
-def _hidden(y: Any) -> np.ndarray | None:
-    """Where a table of floats has NaN; None if nowhere, or if it is no such table."""
-    values = np.asarray(y)
-    found = np.isnan(values) if values.dtype.kind == "f" else np.zeros(1, dtype=bool)
-    return found if bool(found.any()) and not bool(found.all()) else None
