@@ -102,9 +102,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         each = 3 if self.lever is None else 3 * POINTS
         if points.shape[1] % each:
             fix = "pass x, y and z of every marker, in m, or of three points for every pose; distances, heights and "
-            fix += (
-                "images belong to devices whose places are found from all rows and that X does not name: dc.calibrate"
-            )
+            fix += "images belong to devices whose places are found from all rows: dc.calibrate"
             raise MeasurementError.of("`y`", expected=f"{each} P columns", got=points.shape[1], fix=fix)
         if self.lever is None:
             return Measurements(q, points.reshape(len(q), -1, 3), robot.joint_names, on=self.on)

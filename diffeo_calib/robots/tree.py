@@ -72,18 +72,14 @@ class Tree:
         kinds: their kinds.
         limits: (n, 2) their lower and upper limits [rad or m].
         moving_names: names of the n_all moving joints.
-        coupling: (n_all, n) and
-        coupling_offset: (n_all,) values of the moving joints are ``coupling @ q + coupling_offset`` [rad or m].
-        axes: (n_all, 3) axes, each in its joint's frame.
-        offsets: (n_all, 4, 4) the constant transforms O_l.
-        tip_offsets: (tips, 4, 4) the constant transforms O_tip.
+        coupling, coupling_offset: values of the moving joints are ``coupling @ q + coupling_offset`` [rad or m].
+        axes: (n_all, 3) axes, each in its joint's frame. revolute: (n_all,) boolean, False for a slide.
+        offsets, tip_offsets: the constant transforms O_l (n_all, 4, 4) and O_tip (tips, 4, 4).
         place_offsets: (F, 4, 4) those of all F places: joints, tips, loads, ground.
         before: for each of the F places the number of the moving joint before it, -1 for the base.
         ancestors: (F, n_all) boolean A, whether joint l moves place f.
         ground_place: number of the place of the link on the ground, the last one; None where that is the base.
-        revolute: (n_all,) boolean, False for a slide.
-        motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`.
-        arrays: the same constants as NumPy arrays.
+        motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`. arrays: the same constants as NumPy arrays.
     """
 
     def __init__(
@@ -106,7 +102,11 @@ class Tree:
                 raise RobotError.of(f"the {what} of a robot", expected="text", got=as_written(text))
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
         self.moving_names = tuple(joint.name for joint in moving)
-        self._check_structure()
+        count = len(self.joints)
+        if len(self.parents) != count or not all(BASE <= p < k for k, p in enumerate(self.parents)):
+            raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
+        if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
+            raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
         active = [joint for joint in [*moving, *self.drivers] if joint.kind != "fixed" and joint.mimic is None]
         self.joint_names = tuple(joint.name for joint in active)
         self.kinds = tuple(joint.kind for joint in active)
@@ -119,14 +119,6 @@ class Tree:
         self.place_offsets, self.before = torch.from_numpy(found.offsets), tuple(found.before.tolist())
         self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
-
-    def _check_structure(self) -> None:
-        """Raise RobotError unless joints, parents and ends make a tree."""
-        count = len(self.joints)
-        if len(self.parents) != count or not all(BASE <= p < k for k, p in enumerate(self.parents)):
-            raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
-        if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
-            raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
 
     def reversed(self, tip: str | None = None) -> Tree:
         """The same robot with one of its tips as base; gravity still acts as on the ground.
@@ -150,11 +142,8 @@ class Tree:
         """Name, links, joints and their order as JSON values, for :func:`robot_from_config`."""
         ends = {"tips": [[tip, self.ends[tip]] for tip in self.tips], "loads": [[t, self.ends[t]] for t in self.loads]}
         structure = {"parents": list(self.parents), **ends, "ground": self.ground}
-        return (
-            {"name": self.name, "base": self.base, "joints": [j.to_config() for j in self.joints]}
-            | structure
-            | {"drivers": [joint.to_config() for joint in self.drivers]}
-        )
+        joints, drivers = ([joint.to_config() for joint in part] for part in (self.joints, self.drivers))
+        return {"name": self.name, "base": self.base, "joints": joints, **structure, "drivers": drivers}
 
     def __repr__(self) -> str:
         mimics = [name for name in self.moving_names if name not in self.joint_names]
@@ -210,21 +199,15 @@ class Tree:
         Infinite if a prismatic joint has no limits. The stroke of a mimic joint follows from the limits of the joints
         that drive it; its own limits count only where those have none.
         """
-        lengths, strokes = self.place_offsets[:, :3, 3].norm(dim=1), self._largest_values()
-        steps = lengths[: self.moving] + torch.where(self.revolute, 0.0, strokes)
-        ends = self.tip_places
-        return float((torch.where(self.ancestors[ends], steps, 0.0).sum(1) + lengths[ends]).max())
-
-    def _largest_values(self) -> Tensor:
-        """Largest absolute value (n_all,) of each moving joint within the limits [rad or m]."""
         ends = self.coupling[..., None] * self.limits  # (n_all, n, 2)
         ends = torch.where(self.coupling[..., None] == 0, 0.0, ends)  # no limits times no effect is not NaN
-        low, high = ends.amin(dim=2).sum(dim=1), ends.amax(dim=2).sum(dim=1)
-        driven = torch.maximum((low + self.coupling_offset).abs(), (high + self.coupling_offset).abs())
-        moving = [joint for joint in self.joints if joint.kind != "fixed"]
-        strokes = [max(abs(joint.lower), abs(joint.upper)) for joint in moving]
-        own = torch.tensor(strokes, dtype=torch.float64, device="cpu")
-        return torch.where(driven.isinf(), own, driven)
+        driven = torch.stack([ends.amin(2).sum(1), ends.amax(2).sum(1)]) + self.coupling_offset
+        own = [max(abs(joint.lower), abs(joint.upper)) for joint in self.joints if joint.kind != "fixed"]
+        strokes, tips = driven.abs().amax(0), self.tip_places  # largest values within the limits [rad or m]
+        strokes = torch.where(strokes.isinf(), strokes.new_tensor(own), strokes)
+        lengths = self.place_offsets[:, :3, 3].norm(dim=1)
+        steps = lengths[: self.moving] + torch.where(self.revolute, 0.0, strokes)
+        return float((torch.where(self.ancestors[tips], steps, 0.0).sum(1) + lengths[tips]).max())
 
     def __call__(self, q: Tensor) -> Tensor:
         """Poses of the tip in the base, (N, 4, 4) [m]; (N, tips, 4, 4) if there are several.
@@ -304,19 +287,16 @@ class Tree:
         Raises:
             InputError: wrong shape, values that are not finite, or a data frame without a column for every joint.
         """
+        order = f"pass the {self.n} joints in the order of `robot.joint_names`"
         if isinstance(q, Tensor):
             q = real_tensor(q, "q")
         else:
-            q = as_tensor(named_columns(q, self.joint_names, "q"), "q", ("N", "n"), empty=True, fix=self._order)
+            q = as_tensor(named_columns(q, self.joint_names, "q"), "q", ("N", "n"), empty=True, fix=order)
         if q.ndim != 2 or q.shape[1] != self.n:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
-            raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
+            raise InputError.of(what, got=str(tuple(q.shape)), fix=order)
         check_finite(q, "q")
         return q
-
-    @property
-    def _order(self) -> str:
-        return f"pass the {self.n} joints in the order of `robot.joint_names`"
 
 
 def seen_from(
@@ -336,26 +316,24 @@ def seen_from(
     Returns the joints, first those from the new base to the old one, their parents, and for every link of the old
     numbers (-1 for the old base) the number of the last joint before it now, -1 for the new base.
     """
+    way, end = [], link
+    while end != BASE:
+        way.append(end)
+        end = parents[end]
     found: list[Joint] = []
     before: list[int] = []
-    last = {link: BASE}
-
-    def add(joint: Joint, parent: int) -> int:
-        found.append(joint)
-        before.append(parent)
-        return len(found) - 1
-
-    way = []
-    while link != BASE:
-        way.append(link)
-        end = last[link]
-        for joint in backwards(joints[link]):
-            end = add(joint, end)
-        link = parents[link]
-        last[link] = end
+    last, end = {link: BASE}, BASE
+    for number in way:
+        for joint in backwards(joints[number]):
+            found.append(joint)
+            before.append(end)
+            end = len(found) - 1
+        last[parents[number]] = end
     for number, joint in enumerate(joints):
         if number not in way:
-            last[number] = add(joint, last[parents[number]])
+            found.append(joint)
+            before.append(last[parents[number]])
+            last[number] = len(found) - 1
     return found, before, last
 
 
