@@ -56,17 +56,17 @@ class Constants(nn.Module):
 
     def __init__(self, record: Any) -> None:
         super().__init__()
-        for field in fields(record):
-            value = getattr(record, field.name)
+        for name in record._fields if isinstance(record, tuple) else [field.name for field in fields(record)]:
+            value = getattr(record, name)
             if isinstance(value, np.ndarray) and value.dtype == np.float64:
                 tensor = torch.tensor(np.ascontiguousarray(value), dtype=torch.float64, device=HOST)
-                self.register_buffer(field.name, tensor)
+                self.register_buffer(name, tensor)
             elif isinstance(value, np.ndarray):
-                setattr(self, field.name, value.tolist())
-            elif field.name == "terms":
+                setattr(self, name, value.tolist())
+            elif name == "terms":
                 self.terms = nn.ModuleList(map(Constants, value))
-            elif field.name != "stages":  # tables: their cells are buffers
-                setattr(self, field.name, Constants(value) if is_dataclass(value) else value)
+            elif name != "stages":  # tables: their cells are buffers
+                setattr(self, name, Constants(value) if is_dataclass(value) or hasattr(value, "_fields") else value)
 
 
 def _rigid_inverse(poses: Tensor) -> Tensor:

@@ -29,15 +29,13 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.payload import Payload
-from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
-from diffeo_calib.runtime.chain import Compliance, load_slopes, loads
+from diffeo_calib.runtime.chain import Compliance, Masses, load_slopes, loads
 
 
 class GravitySag:
@@ -57,6 +55,7 @@ class GravitySag:
     def __init__(self, chain: Tree, payload: Payload | None = None) -> None:
         self.chain, self.payload = chain, payload
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
+        self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
 
     @property
     def size(self) -> int:
@@ -66,17 +65,22 @@ class GravitySag:
     @cached_property
     def joints(self) -> Tensor:
         """(K,) the moving joint of every coefficient."""
-        return self._each("joint", torch.int64)[self._numbers]
+        return self._each("joint", torch.int64)
 
     @cached_property
     def own(self) -> Tensor:
         """(K,) True for a compliance along the joint's own motion, False for a lateral one."""
-        return self._each("own", torch.bool)[self._numbers]
+        return self._each("own", torch.bool)
 
     @cached_property
     def loaded(self) -> Tensor:
         """(K,) True for the coefficients of the payload, the last ones."""
-        return self._each("loaded", torch.bool)[self._numbers]
+        return self._each("loaded", torch.bool)
+
+    def _each(self, name: str, dtype: torch.dtype) -> Tensor:
+        """A property of the compliance of every coefficient."""
+        values = [getattr(one, name) for one in self.compliances for _ in range(one.size)]
+        return torch.tensor(values, dtype=dtype, device="cpu")
 
     @property
     def components(self) -> Tensor:
@@ -92,37 +96,32 @@ class GravitySag:
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
-        frames, (numbers, places) = self._frames(q), self._loads.to(q.device)
-        sag = self._sag(q.new_zeros(self.size))
-        origins, joints = frames[..., :3, 3], sag.joints[numbers]
-        e = (frames[:, joints, :3, :3] @ sag.axes[numbers][..., None])[..., 0]  # (N, K / 3, 3)
-        pulls = torch.linalg.cross(e, origins[:, places] - origins[:, joints])
-        pulls = torch.where((places == joints)[:, None], e, pulls)
-        return (pulls * self._amounts(q)[:, numbers, None]).flatten(1)
+        masses, frames = self._on(q), self._frames(q)
+        e = (frames[:, masses.joints, :3, :3] @ masses.axes[..., None])[..., 0]  # (N, compliances, 3)
+        e = masses.own.mT @ e  # (N, masses, 3)
+        pulls = torch.linalg.cross(e, masses.arms @ frames[..., :3, 3]) + e * masses.slides
+        return (pulls * (self._loads(q) @ masses.own)[..., None]).flatten(1)
 
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
         """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, n_all, 6) [m, rad]."""
-        sag = self._sag(w)
+        sag = self._on(q).sag(w)
         e, m = loads(sag, self._frames(q))
-        return ((self._amounts(q) * (e * m).sum(-1)) @ sag.directions).unflatten(1, (-1, 6))
+        return ((self._loads(q) * (e * m).sum(-1)) @ sag.directions).unflatten(1, (-1, 6))
 
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
         """Derivatives of the twists by the joints: (N, n_all, 6, n)."""
-        sag, chain = self._sag(w), self.chain
-        constants = (
-            chain.axes,
-            chain.revolute,
-            torch.from_numpy(chain.arrays.moved),
-            torch.from_numpy(chain.arrays.signs),
-        )
-        by_moving = load_slopes(_Robot(*(each.to(q.device) for each in constants)), sag, self._frames(q))
-        slopes = chain.by_active(self._amounts(q)[..., None] * by_moving)  # (N, compliances, n)
+        sag, chain = self._on(q).sag(w), self.chain
+        moved, signs = torch.from_numpy(chain.arrays.moved), torch.from_numpy(chain.arrays.signs)
+        robot = _Robot(*(part.to(q.device) for part in (chain.axes, chain.revolute, moved, signs)))
+        by_moving = load_slopes(robot, sag, self._frames(q))
+        slopes = chain.by_active(self._loads(q)[..., None] * by_moving)  # (N, compliances, n)
         return (sag.directions.mT @ slopes).unflatten(1, (-1, 6))
 
     def sensitivities(self, q: Tensor, by_twist: Tensor) -> Tensor:
         """Derivatives by the coefficients (N, m, K) from the derivatives by the twists (N, m, joints, 6)."""
-        by_compliance = by_twist.flatten(2) @ self._constants["directions"].to(q.device).mT
-        return by_compliance[..., self._numbers.to(q.device)] * self.features(q)[:, None]
+        masses = self._on(q)
+        by_mass = by_twist.flatten(2) @ masses.directions.mT @ masses.own
+        return by_mass.repeat_interleave(3, -1) * self.features(q)[:, None]
 
     def folded(self, w: Tensor) -> Tensor:
         """The coefficients (K,) of a robot that carries its payload everywhere as those of one without payload.
@@ -144,62 +143,20 @@ class GravitySag:
             parts[k] = torch.cat([parts[k][:at], parts[k][at : at + 3] + amount * load, parts[k][at + 3 :]])
         return torch.cat([w[:0], *parts[: len(unladen)]])
 
-    def _each(self, name: str, dtype: torch.dtype) -> Tensor:
-        """A property of every compliance."""
-        return torch.tensor([getattr(one, name) for one in self.compliances], dtype=dtype, device="cpu")
+    def _on(self, q: Tensor) -> Masses:
+        """The masses on the device of joint values."""
+        return Masses(*(part.to(q.device) for part in self._masses))
 
-    def _amounts(self, q: Tensor) -> Tensor:
+    def _loads(self, q: Tensor) -> Tensor:
         """(N or 1, compliances) the load of each in units: the payload where that is the load, else 1."""
+        loaded = torch.tensor([one.loaded for one in self.compliances], dtype=torch.bool, device=q.device)
         amounts = 1.0 if self.payload is None else self.payload.amounts(q)
-        return torch.where(self._each("loaded", torch.bool).to(q.device), amounts, q.new_ones(1, 1))
+        return torch.where(loaded, amounts, q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
         """All places in the ground's frame: (N, F, 4, 4)."""
         places, ground = self.chain.places(q), self.chain.ground_place
         return places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
-
-    def _sag(self, w: Tensor) -> _Sag:
-        """The tensors that runtime/chain.py takes for a :class:`Sag` with these coefficients."""
-        (numbers, places), F, count = self._loads.to(w.device), len(self.chain.before), len(self.compliances)
-        constants = {name: value.to(w.device) for name, value in self._constants.items()}
-        joints, c = constants["joints"][numbers], w.view(-1, 3)
-        slides = (places == joints)[:, None]
-        turning = skew(c).masked_fill(slides[..., None], 0.0)
-        moments = w.new_zeros(count * F, 3, 3).index_add(0, numbers * F + places, -turning)
-        moments = moments.index_add(0, numbers * F + joints, turning).view(count, F, 3, 3).transpose(1, 2)
-        forces = w.new_zeros(count, 3).index_add(0, numbers, c.masked_fill(~slides, 0.0))
-        return _Sag(moments=moments.reshape(3 * count, 3 * F), forces=forces, **constants)
-
-    @cached_property
-    def _loads(self) -> Tensor:
-        """(2, K / 3) compliance and place of every mass; the joint itself for the force along a slide."""
-        pairs = [(k, place) for k, c in enumerate(self.compliances) for place in c.places or (c.joint,)]
-        return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2).T
-
-    @cached_property
-    def _numbers(self) -> Tensor:
-        """(K,) the number of the compliance of every feature."""
-        return self._loads[0].repeat_interleave(3)
-
-    @cached_property
-    def _constants(self) -> dict[str, Tensor]:
-        """See :class:`diffeo_calib.runtime.chain.Sag`."""
-        directions = torch.zeros(len(self.compliances), self.chain.moving, 6, dtype=torch.float64, device="cpu")
-        for k, compliance in enumerate(self.compliances):
-            directions[k, compliance.joint] = torch.from_numpy(compliance.direction)
-        axes = np.array([compliance.axis for compliance in self.compliances], dtype=float).reshape(-1, 3)
-        joints = self._each("joint", torch.int64)
-        return {"joints": joints, "axes": torch.from_numpy(axes), "directions": directions.flatten(1)}
-
-
-class _Sag(NamedTuple):
-    """That of :class:`diffeo_calib.runtime.chain.Sag`; compilers follow named tuples."""
-
-    moments: Tensor
-    forces: Tensor
-    joints: Tensor
-    axes: Tensor
-    directions: Tensor
 
 
 class _Robot(NamedTuple):

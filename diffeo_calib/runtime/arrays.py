@@ -29,13 +29,13 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 ONE = np.eye(3)
-_SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
-"""w @ _SKEW is [w]x, row by row."""
+SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+"""w @ SKEW is [w]x, row by row."""
 
 
 def skew(w: Array) -> Array:
     """[w]x: (..., 3) -> (..., 3, 3)."""
-    return (w @ _SKEW).reshape(*w.shape, 3)
+    return (w @ SKEW).reshape(*w.shape, 3)
 
 
 def transforms(twists: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
-from diffeo_calib.runtime.chain import CalibratedChain, NominalChain, Sag
+from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
@@ -130,29 +130,12 @@ def calibrated_chain(
     L, T = len(nominal.axes), len(nominal.tips)
     twists = theta[: 6 + 6 * L].reshape(-1, 6)
     offsets = nominal.offsets[:L] @ joint_errors
-    sag = None if coefficients is None or not coefficients.any() else gravity_sag(nominal, coefficients)
-    if sag is None:
-        offsets, constant = offsets @ transforms(twists[1:]), np.zeros_like(twists[1:])
+    sag, constant = None, twists[1:]
+    if coefficients is not None and coefficients.any():
+        sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
     else:
-        constant = twists[1:]
+        offsets, constant = offsets @ transforms(constant), np.zeros_like(constant)
     return CalibratedChain(nominal, base @ transforms(twists[0]), offsets, constant, nominal.offsets[L : L + T], sag)
-
-
-def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
-    """The sag with these coefficients: m_k = sum_f (o_f - o_l) x c_f for the masses at the places f beyond joint l."""
-    own, F, L = nominal.compliances, len(nominal.offsets), len(nominal.axes)
-    moments, forces, directions = (np.zeros((len(own), *shape)) for shape in ((3, F, 3), (3,), (L, 6)))
-    sizes = np.cumsum([compliance.size for compliance in own])
-    for k, (compliance, w) in enumerate(zip(own, np.split(coefficients, sizes[:-1]), strict=True)):
-        c = w.reshape(-1, 3)
-        if compliance.places:
-            moments[k, :, list(compliance.places)] = -skew(c)
-            moments[k, :, compliance.joint] = skew(c.sum(0))
-        else:
-            forces[k] = c[0]
-        directions[k, compliance.joint] = compliance.direction
-    axes, joints = np.array([c.axis for c in own]), np.array([c.joint for c in own])
-    return Sag(joints, axes, moments.reshape(-1, 3 * F), forces, directions.reshape(-1, 6 * L))
 
 
 def recorded_flow(

@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import ONE, Array, cross, skew, transforms
+from diffeo_calib.runtime.arrays import ONE, SKEW, Array, cross, skew, transforms
 from diffeo_calib.runtime.flow import NUMPY, Operations
 
 COINCIDENT_FRAMES_M = 1e-6
@@ -145,18 +145,51 @@ def perpendicular(axis: Array) -> Array:
     return (np.eye(3) - 2.0 * np.outer(v, v) / (v @ v))[1:]
 
 
-@dataclass(frozen=True, eq=False)
-class Sag:
+class Sag(NamedTuple):
     """Gravity sag: twist coordinates e . m, with unit vectors e of nominal frames and moments m of unknown masses.
 
-    The moments are linear in the origins o_f of the nominal frames: m_k = sum_f W_kf o_f + w_k.
+    The moments are linear in the origins o_f of the nominal frames: m_k = sum_f W_kf o_f + w_k. Arrays of any library;
+    compilers follow named tuples.
     """
 
-    joints: np.ndarray  # (K,) the moving joint of every coordinate
-    axes: Array  # (K, 3) its unit vector in the joint's frame
-    moments: Array  # (3 K, 3 F) W
-    forces: Array  # (K, 3) w, constant forces on prismatic joints
-    directions: Array  # (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad]
+    joints: Any  # (K,) the moving joint of every coordinate
+    axes: Any  # (K, 3) its unit vector in the joint's frame
+    moments: Any  # (3 K, 3 F) W
+    forces: Any  # (K, 3) w, constant forces on prismatic joints
+    directions: Any  # (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad]
+
+
+class Masses(NamedTuple):
+    """The masses, M in all, that pull at K compliances: constants of their :class:`Sag`."""
+
+    joints: Any  # (K,), axes (K, 3), directions (K, 6 n_all): see Sag
+    axes: Any
+    directions: Any
+    own: Any  # (K, M) 1 where the mass pulls at the compliance
+    arms: Any  # (M, F) of the origins of the places: from its joint to the mass; zero for the force along a slide
+    slides: Any  # (M, 1) 1 for the force along a slide
+    skew: Any  # (3, 9) c @ skew is [c]x, row by row
+
+    @classmethod
+    def of(cls, compliances: Sequence[Compliance], robot: NominalChain) -> Masses:
+        """Those of some compliances of a robot."""
+        pairs = [(k, c.joint, place) for k, c in enumerate(compliances) for place in c.places or (c.joint,)]
+        k, joint, place = np.array(pairs, dtype=int).reshape(-1, 3).T
+        joints, units = np.array([c.joint for c in compliances], dtype=int), np.eye(len(robot.offsets))
+        directions = np.zeros((len(compliances), len(robot.axes), 6))
+        for number, compliance in enumerate(compliances):
+            directions[number, compliance.joint] = compliance.direction
+        axes = np.array([c.axis for c in compliances]).reshape(-1, 3)
+        own, arms, slides = np.eye(len(compliances))[:, k], units[place] - units[joint], (place == joint)[:, None]
+        return cls(joints, axes, directions.reshape(len(joints), -1), own, arms, slides.astype(float), SKEW)
+
+    def sag(self, coefficients: Any) -> Sag:
+        """The sag with these coefficients c (3 M,): m = sum (o_f - o_l) x c for the masses at the places f."""
+        c, K, F = coefficients.reshape(-1, 3), len(self.joints), self.arms.shape[1]
+        blocks = self.arms[:, :, None, None] * (c @ self.skew).reshape(-1, 1, 3, 3)  # (M, F, 3, 3)
+        moments = -(self.own @ blocks.reshape(len(c), 9 * F)).reshape(K, F, 3, 3).swapaxes(1, 2)
+        forces = self.own @ (c * self.slides)
+        return Sag(self.joints, self.axes, moments.reshape(3 * K, 3 * F), forces, self.directions)
 
 
 @dataclass(frozen=True, eq=False)
