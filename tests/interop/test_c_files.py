@@ -187,10 +187,6 @@ def test_models_without_constant_stages(tmp_path: Path) -> None:
         write_c(model, tmp_path / "model.c")
 
 
-def test_the_public_name() -> None:
-    assert dc.interop.write_c is write_c  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def test_files_of_other_origin_stay(tmp_path: Path) -> None:
     model, header = model_of(CHAINS["one joint"]), tmp_path / "model.h"
     header.write_text("/* mine */")

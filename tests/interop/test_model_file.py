@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from math_bank import constant_kernel
@@ -49,34 +48,6 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
     assert torch.equal(again.robot.limits, model.robot.limits)
     dc.save(again, tmp_path / "again.safetensors")
     assert torch.equal(dc.load(tmp_path / "again.safetensors")(q), model(q))
-
-
-@pytest.mark.slow
-def test_robots_with_mimic_joints_come_back_bit_for_bit(tmp_path: Path) -> None:
-    follow: dict[str, float] = {"tilt": -1.0, "bend": -0.25, "pan": 0.1}
-    rows = [
-        (0.1, 1.6, 0.3),
-        (0.0, -1.5, 0.1),
-        (0.5, 0.2, 0.0, 0.1, "revolute", follow, 0.3),
-        (0.4, 1.2, 0.1),
-        (0.1, 0, 0.2),
-    ]
-    robot = dc.from_dh(rows, names=["pan", "tilt", "level", "bend", "turn"])
-    q = torch.from_numpy(np.random.default_rng(0).uniform(-1.5, 1.5, (60, 4)))
-    points = robot(q + 1e-3 * (2 * q).sin())[:, None, :3, 3]
-    points = points + 1e-5 * torch.from_numpy(np.random.default_rng(1).standard_normal((60, 1, 3)))
-    result = dc.calibrate(robot, dc.Measurements(q[:30], points[:30], robot.joint_names))
-    errors = [dc.evaluate(stage, dc.Measurements(q[30:], points[30:])).rms for stage in result.stages.values()]
-    assert errors[-1] < errors[0] / 5
-    dc.save(result.model, tmp_path / "model.safetensors")
-    again = dc.load(tmp_path / "model.safetensors")
-    assert isinstance(again, dc.CalibratedKinematics)
-    assert [joint.mimic for joint in again.robot.joints] == [joint.mimic for joint in robot.joints]
-    assert torch.equal(again.robot.coupling, robot.coupling)
-    assert torch.equal(again.robot.coupling_offset, robot.coupling_offset)
-    assert (again.robot.joint_names, again.robot.moving_names) == (robot.joint_names, robot.moving_names)
-    assert torch.equal(again(q), result.model(q))
-    assert torch.equal(again.jacobian(q), result.model.jacobian(q))
 
 
 def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
@@ -154,17 +125,6 @@ def test_the_header_describes_the_model(arm: Case, tmp_path: Path) -> None:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert all(t.dtype == torch.float64 for t in tensors.values())
     assert tensors["x"].shape == (60, 6)
-
-
-def test_models_of_poses_give_the_same_poses(posed: Case, tmp_path: Path) -> None:
-    path, q = tmp_path / "posed.safetensors", posed.test.q[:20]
-    dc.save(posed.model, path)
-    assert header_of(path)["lever"] == 0.1
-    again = dc.load(path)
-    assert isinstance(again, dc.CalibratedKinematics)
-    assert torch.equal(again.poses(q), posed.model.poses(q))
-    assert torch.equal(again.predict_poses(q)[1], posed.model.predict_poses(q)[1])
-    assert repr(dc.evaluate(again, posed.test)) == repr(dc.evaluate(posed.model, posed.test))
 
 
 def test_a_plain_function_has_no_lever(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from model_file_bank import planar
 from robots_bank import CHAINS, draw, every_chain
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.robots import Chain
 from diffeo_calib.robots.se3 import twist_transform
@@ -65,16 +65,6 @@ def test_models_that_need_torch(tmp_path: Path) -> None:
         load_numpy(path)
     dc.save(model_of(CHAINS["arm"], dc.TorchDiffEq()), path)
     with pytest.raises(InputError, match="expected fixed steps"):
-        load_numpy(path)
-
-
-def test_damaged_files(tmp_path: Path) -> None:
-    path = tmp_path / "model.safetensors"
-    dc.save(model_of(CHAINS["arm"]), path)
-    data = bytearray(path.read_bytes())
-    data[-5] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(ModelFileError, match="checksum"):
         load_numpy(path)
 
 

@@ -14,26 +14,11 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 
 
-def test_saving_over_a_folder(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    (tmp_path / "model").mkdir()
-    with pytest.raises(InputError, match="cannot be written"):
-        dc.save(small, tmp_path / "model")
-    assert [p.name for p in tmp_path.iterdir()] == ["model"]
-
-
 @pytest.mark.parametrize("what", [3, "model", None, torch.zeros(3)])
 def test_only_models_are_saved(what: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"`model`: expected a calibrated model, got .*result.model"):
         dc.save(what, tmp_path / "model")
     assert not list(tmp_path.iterdir())
-
-
-def test_an_existing_file_is_replaced(small: dc.CalibratedKinematics, sound: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "model.safetensors"
-    path.write_text("old")
-    dc.save(small, str(path))
-    assert path.read_bytes() == sound
-    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
 
 
 @pytest.mark.parametrize("where", ["fsync", "replace"])

@@ -6,7 +6,6 @@ from math import cos, nan, pi, sin
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -215,8 +214,3 @@ def test_names_of_tips_are_their_own(tip: str) -> None:
 def test_tables_of_another_kind(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(RobotError, match=message):
         from_dh(**arguments)
-
-
-def test_numbers_of_rows_from_numpy() -> None:
-    rows = [*FORK[:2], DHRow(0.3, 0.9, 0.1, parent=np.int64(0))]  # pyright: ignore[reportArgumentType]
-    assert from_dh(rows, tips={"x": np.int64(1)}).tips == ("x",)  # pyright: ignore[reportArgumentType]

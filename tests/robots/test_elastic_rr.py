@@ -6,7 +6,6 @@ from math import pi
 import pytest
 import torch
 
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
@@ -76,16 +75,3 @@ def test_smooth_and_periodic(k0: Callable[[torch.Tensor], torch.Tensor]) -> None
     each = torch.func.vmap(torch.func.jacrev(lambda z: k0(z[None])[0]))(x.detach())
     both = torch.func.vmap(torch.func.jacfwd(lambda z: k0(z[None])[0]))(x.detach())
     torch.testing.assert_close(each, both)
-
-
-def test_grid_leaves_out_pi() -> None:
-    grid = elastic_rr.grid(4)
-    assert grid.shape == (16, 2)
-    assert elastic_rr.grid().shape == (256, 2)
-    assert sorted(set(grid[:, 0].tolist())) == [-pi, -pi / 2, 0.0, pi / 2]
-    assert len({tuple(row) for row in grid.tolist()}) == 16
-
-
-def test_wrong_shapes_are_explained() -> None:
-    with pytest.raises(InputError, match=r"`x` has the wrong shape: expected \(N, 2\), got \(4, 3\)"):
-        elastic_rr.real(torch.zeros(4, 3))

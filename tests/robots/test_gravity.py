@@ -169,17 +169,6 @@ def test_sensitivities_are_derivatives_by_the_coefficients(chain: Chain) -> None
     torch.testing.assert_close(sag.sensitivities(q, by_twist), expected, rtol=1e-12, atol=1e-13)
 
 
-@every_chain
-def test_no_rows(chain: Chain) -> None:
-    sag, q = GravitySag(chain), torch.zeros(0, chain.n, dtype=torch.float64)
-    w = draw(sag.size)
-    assert sag.features(q).shape == (0, sag.size)
-    assert sag.twists(q, w).shape == (0, chain.moving, 6)
-    assert sag.twist_slopes(q, w).shape == (0, chain.moving, 6, chain.n)
-    none = torch.zeros(0, 3, chain.moving, 6, dtype=torch.float64)
-    assert sag.sensitivities(q, none).shape == (0, 3, sag.size)
-
-
 # --- the compliances of a chain --------------------------------------------------------------------------------------
 
 
@@ -202,17 +191,6 @@ def test_directions_are_the_axis_and_two_across_it(chain: Chain) -> None:
             continue
         turns = torch.tensor(np.array([f.axis for f in mine if f.places]))
         torch.testing.assert_close(turns @ turns.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
-
-
-@every_chain
-def test_tables_describe_every_coefficient(chain: Chain) -> None:
-    sag = GravitySag(chain)
-    assert sag.size == sum(f.size for f in sag.compliances) == len(sag.joints)
-    for compliance in sag.compliances:
-        used = columns(sag, compliance)
-        assert sag.joints[used].tolist() == [compliance.joint] * compliance.size
-        assert sag.own[used].tolist() == [compliance.own] * compliance.size
-        assert sag.components[used].tolist() == [0, 1, 2] * (compliance.size // 3)
 
 
 def test_frames_in_one_point_are_one_place() -> None:

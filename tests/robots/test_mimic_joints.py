@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from mimic_bank import ACTIVE, CHAIN, FREE, KINDS, MOVING, build, crooked_joints, expand
+from mimic_bank import CHAIN, FREE, KINDS, MOVING, build, crooked_joints, expand
 from robots_bank import draw
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import Chain, Joint
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
@@ -40,21 +40,6 @@ def test_poses_multiply_out_with_the_values_of_all_joints() -> None:
         torch.testing.assert_close(row, pose, rtol=0, atol=1e-13)
 
 
-def test_attributes_of_active_and_of_all_moving_joints() -> None:
-    assert CHAIN.joint_names == tuple(ACTIVE)
-    assert (CHAIN.n, CHAIN.moving) == (3, 7)
-    assert CHAIN.moving_names == tuple(MOVING)
-    assert CHAIN.kinds == ("continuous", "prismatic", "revolute")
-    assert CHAIN.periodic == (True, False, True)
-    assert CHAIN.limits.tolist() == [[-inf, inf], [-0.3, 0.5], [-2.0, 1.5]]
-    assert CHAIN.revolute.tolist() == [True, True, False, True, True, False, True]
-    assert CHAIN.axes.shape == (7, 3)
-    assert CHAIN.offsets.shape == (7, 4, 4)
-    assert CHAIN.motion_terms.shape == (4, 7, 4, 4)
-    assert CHAIN.joint_frames(draw(2, 3)).shape == (2, 7, 4, 4)
-    assert repr(CHAIN).endswith("3 joints: waist, rail, elbow; mimic joints: early, sum, rack, second)")
-
-
 def test_coupling_is_constant_and_resolved_to_active_joints() -> None:
     expected = [[0, 1.5, 0], [1, 0, 0], [0, 1, 0], [-1, 0, -1], [0, 0, 1], [0, 0, 0.1], [0.75, 0, 0.7]]
     torch.testing.assert_close(CHAIN.coupling, torch.tensor(expected, dtype=torch.float64))
@@ -71,44 +56,6 @@ def test_it_is_the_same_robot_as_one_with_all_joints_active() -> None:
     torch.testing.assert_close(CHAIN(q), FREE(full), rtol=0, atol=1e-14)
     torch.testing.assert_close(CHAIN.joint_frames(q), FREE.joint_frames(full), rtol=0, atol=1e-14)
     torch.testing.assert_close(CHAIN.jacobian(q), FREE.jacobian(full) @ CHAIN.coupling, rtol=0, atol=1e-13)
-
-
-def test_chains_without_mimic_joints_cost_nothing_more() -> None:
-    q, slopes = draw(4, 7), draw(4, 6, 7)
-    assert (FREE.n, FREE.moving, FREE.moving_names) == (7, 7, FREE.joint_names)
-    assert FREE.moving_values(q) is q
-    assert FREE.by_active(slopes) is slopes
-    assert torch.equal(FREE.coupling, torch.eye(7, dtype=torch.float64))
-    assert torch.equal(FREE.coupling_offset, torch.zeros(7, dtype=torch.float64))
-    assert "mimic" not in repr(FREE)
-
-
-def test_jacobian_is_the_derivative_by_the_active_joints() -> None:
-    q = draw(4, 3)
-    slopes = torch.func.vmap(torch.func.jacrev(lambda x: CHAIN(x[None])[0]))(q)  # (N, 4, 4, n)
-    jacobian = CHAIN.jacobian(q)
-    assert jacobian.shape == (4, 6, 3)
-    torch.testing.assert_close(jacobian[:, :3], slopes[:, :3, 3], rtol=0, atol=1e-13)
-    spin = torch.einsum("nabj,ncb->njac", slopes[:, :3, :3], CHAIN(q)[:, :3, :3])
-    turned = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], dim=1)
-    torch.testing.assert_close(jacobian[:, 3:], turned, rtol=0, atol=1e-13)
-
-
-def test_derivatives_pass_through_every_transform() -> None:
-    q, v = draw(3, 3), draw(3, 3, seed=1)
-    forward = torch.func.jvp(CHAIN, (q,), (v,))[1]
-    torch.testing.assert_close(torch.einsum("nij,nj->ni", CHAIN.jacobian(q), v)[:, :3], forward[:, :3, 3])
-    each = torch.func.vmap(lambda x: CHAIN.jacobian(x[None])[0])(q)
-    torch.testing.assert_close(each, CHAIN.jacobian(q))
-    assert torch.autograd.gradgradcheck(lambda x: CHAIN.jacobian(x)[:, :3], (q[:1].requires_grad_(),))
-    assert CHAIN(q[:0]).shape == (0, 4, 4)
-    assert CHAIN.jacobian(q[:0]).shape == (0, 6, 3)
-
-
-def test_q_has_the_active_joints_only() -> None:
-    message = "`q` must have shape (N, 3) for robot 'machine': got (2, 7); pass the 3 joints in the order of"
-    with pytest.raises(InputError, match=re.escape(message)):
-        CHAIN(torch.zeros(2, 7))
 
 
 def test_a_full_turn_comes_back_only_where_all_mimic_joints_do() -> None:
@@ -187,10 +134,3 @@ def test_two_joints_of_one_name_are_refused() -> None:
     twice = [Joint("t", "revolute", torch.eye(4)), Joint("t", "revolute", torch.eye(4), mimic={"t": 1.0})]
     with pytest.raises(RobotError, match=re.escape("several joints named ['t']")):
         Chain("r", "a", "b", twice)
-
-
-def test_the_mimic_of_a_joint_is_a_copy() -> None:
-    drivers = {"k": 1.0}
-    joint = Joint("j", "revolute", torch.eye(4), mimic=drivers)
-    drivers["k"] = 2.0
-    assert joint.mimic == {"k": 1.0}

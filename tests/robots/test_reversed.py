@@ -16,11 +16,9 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import DHRow, from_dh
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.tree import Chain, Ends, Tree, robot_from_config
 
@@ -89,18 +87,6 @@ def test_gravity_is_that_of_the_ground(robot: Tree) -> None:
     loads = {load: back.ends[load] for load in back.loads}
     hanging = Tree("x", back.base, back.joints, back.parents, Ends({tip: back.ends[tip] for tip in back.tips}, loads))
     assert contained(here, own_features(hanging, own)) > 1e-2
-
-
-def test_errors_and_sag_have_exact_derivatives() -> None:
-    robot = two_arms().reversed("right")
-    q, generator = draw(2, robot.n), torch.Generator().manual_seed(0)
-    tool = 0.1 * torch.randn(2, 3, dtype=torch.float64, generator=generator)
-    nominal = GeometryMap(Geometry.nominal(robot).with_tool(tool), elastic=True)
-    theta = 1e-3 * torch.randn(nominal.parameters, dtype=torch.float64, generator=generator)
-    by_joint = torch.func.vmap(torch.func.jacrev(lambda row: nominal(row[None], theta)[0]))(q)
-    assert_close(nominal.jacobian(q, theta), by_joint, rtol=0, atol=1e-13)
-    by_theta = torch.func.jacrev(lambda values: nominal(q, values))(theta)
-    assert_close(nominal.sensitivities(q, theta), by_theta, rtol=0, atol=1e-13)
 
 
 def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:

@@ -31,11 +31,6 @@ def test_rotation_and_its_jacobian_at_every_angle(angle: float) -> None:
     torch.testing.assert_close(right_jacobian(w), torch.linalg.matrix_exp(block)[:3, 3:], rtol=0, atol=1e-14)
 
 
-def test_skew_is_the_cross_product() -> None:
-    a, b = draw(4, 3), draw(4, 3, seed=1)
-    torch.testing.assert_close((skew(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b), rtol=0, atol=1e-15)
-
-
 def test_a_twist_translates_first() -> None:
     twist = draw(5, 2, 6)
     found = twist_transform(twist)
@@ -69,13 +64,6 @@ def test_nearest_rotations_are_proper_and_nearest() -> None:
     assert bool((distance(others, matrices) >= distance(found, matrices)).all())
     near = found @ rotation(draw(100, 1, 3, seed=4, size=1e-3))
     assert bool((distance(near, matrices) >= distance(found, matrices)).all())
-
-
-def test_nearest_rotations_keep_rotations_and_take_any_batch() -> None:
-    exact = rotation(draw(2, 5, 3, seed=5))
-    torch.testing.assert_close(nearest_rotations(exact), exact, rtol=0, atol=1e-14)
-    torch.testing.assert_close(nearest_rotations(3.0 * exact[1, 2]), exact[1, 2], rtol=0, atol=1e-14)
-    assert nearest_rotations(exact[:, :0]).shape == (2, 0, 3, 3)
 
 
 @pytest.mark.parametrize("entry", [(0, 0, 1.1), (2, 2, -1.0), (3, 0, 0.1), (3, 3, 2.0)])

@@ -171,26 +171,6 @@ def test_the_other_arm_bends_the_torso() -> None:
     assert not changed & arm
 
 
-def test_gravity_turns_with_a_base_in_the_hand() -> None:
-    """Seen from the hand, on a torso that leans, the sag of the same robot moves the other hand the same way."""
-    ground = dc.load_urdf(URDF_FILE, "pelvis", HANDS)
-    held = dc.load_urdf(URDF_FILE, "left_hand", ["right_hand"], ["pelvis"])
-    q = draw(ground, 6)
-    own = q[:, [ground.joint_names.index(name) for name in held.joint_names]]
-    here, there = own_features(ground, q), own_features(held, own)
-    for name in held.moving_names:
-        spread = torch.linalg.lstsq(there[name], here[name], driver="gelsd").solution
-        torch.testing.assert_close(there[name] @ spread, here[name], rtol=0, atol=1e-10)
-
-
-def own_features(robot: Tree, q: Tensor) -> dict[str, Tensor]:
-    """Features of every joint's compliance about its own axis, by its name."""
-    sag = GravitySag(robot)
-    parts = sag.features(q).split([compliance.size for compliance in sag.compliances], 1)
-    own = zip(sag.compliances, parts, strict=True)
-    return {robot.moving_names[compliance.joint]: part for compliance, part in own if compliance.own}
-
-
 # --- descriptions -------------------------------------------------------------------------------------------------
 
 
@@ -212,11 +192,6 @@ def test_a_chain_is_a_tree() -> None:
     assert arm.serial
     for one, other in zip(GravitySag(tree).compliances, GravitySag(arm).compliances, strict=True):
         assert (one.joint, one.own, one.places) == (other.joint, other.own, other.places)
-
-
-def test_branches_that_are_left_out_are_named() -> None:
-    with pytest.warns(DiffeoCalibWarning, match=r"are left out: .*; pass load=\['right_hand'.* --load"):
-        dc.load_urdf(URDF_FILE, "pelvis", "left_hand")
 
 
 @pytest.mark.parametrize(
