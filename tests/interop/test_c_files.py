@@ -5,15 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from c_bank import C99, COMPILER, CPLUSPLUS, STRICT, CModel, compiled, needs_compiler
+from c_bank import C99, COMPILER, CPLUSPLUS, STRICT, compiled, needs_compiler
 from deformation_bank import model_of
-from robots_bank import CHAINS, draw
+from robots_bank import CHAINS
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
@@ -84,27 +83,6 @@ def test_the_example_of_the_header(tmp_path: Path) -> None:
     program = tmp_path / "main"
     compiled([COMPILER, *C99, "-o", program, tmp_path / "main.c", files.source, "-lm"])
     subprocess.run([program], check=True, timeout=60)
-
-
-@needs_compiler
-def test_calls_from_several_threads(files: CFiles) -> None:
-    made = CModel(files.source, 3, 2)
-    q = draw(2, 400, 3, seed=5).numpy()
-    expected = [made.poses_and_jacobian(rows) for rows in q]
-    found: list = [None, None]
-
-    def work(k: int) -> None:
-        found[k] = [made.poses_and_jacobian(q[k]) for _ in range(5)]
-
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for k in range(2):
-        for poses, slopes in found[k]:
-            np.testing.assert_array_equal(poses, expected[k][0])
-            np.testing.assert_array_equal(slopes, expected[k][1])
 
 
 @pytest.mark.slow

@@ -1,8 +1,9 @@
-"""Damaged model files and files of other kinds: each is refused with one clear sentence."""
+"""Damaged model files, files of other kinds, failing saves: each is refused with one clear sentence."""
 
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import struct
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import Any
 
 import pytest
 import torch
-from model_file_bank import refused
+from model_file_bank import Editor, refused
 from product_bank import simulated
 from safetensors.torch import save_file
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import ModelFileError
+from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.interop import model_file, model_header
 
 
@@ -99,3 +100,28 @@ def test_torch_s_own_files_are_not_unpickled(tmp_path: Path) -> None:
     for name in ("trap.pt", "trap.pkl"):
         refused(tmp_path / name)
     assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("what", [3, "model", None, torch.zeros(3)])
+def test_only_models_are_saved(what: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"`model`: expected a calibrated model, got .*result.model"):
+        dc.save(what, tmp_path / "model")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("where", ["fsync", "replace"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failing_save_leaves_the_old_file(
+    where: str, error: BaseException, editor: Editor, sound: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = dc.load(editor.path)
+
+    def fail(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(os, where, fail)
+    expected = InputError if isinstance(error, OSError) else KeyboardInterrupt
+    with pytest.raises(expected, match="No space left.*free some space" if isinstance(error, OSError) else None):
+        dc.save(model, editor.path)
+    assert editor.path.read_bytes() == sound
+    assert [path.name for path in editor.path.parent.iterdir()] == [editor.path.name]

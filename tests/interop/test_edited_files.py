@@ -24,15 +24,6 @@ def test_an_edit_needs_a_new_checksum(editor: Editor) -> None:
     assert model.report["rows"] == 10
 
 
-@pytest.mark.parametrize("name", [*model_header.MOMENTA, *model_header.GEOMETRY])
-def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
-    def edit(tensor: Tensor) -> Tensor:
-        tensor.view(-1)[-1] += 1e-12
-        return tensor
-
-    assert "checksum" in refused(editor.write(set_tensor(name, edit), sign=False))
-
-
 WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "other format": (("format",), 1, "format version 1: expected 3; read it with the version that wrote it"),
     "the format before": (("format",), 2, "format version 2: expected 3; read it with the version that wrote it"),

@@ -74,16 +74,6 @@ def weighted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     return Weighted(request.param)
 
 
-def test_torques_about_every_axis_are_linear_in_its_features(weighted: Weighted) -> None:
-    sag, q = GravitySag(weighted.arm.nominal), weighted.arm.sample(200)
-    features, torques = sag.features(q), weighted.arm.gravity_torques(q)
-    assert float(torques.abs().amax(0)[1:5].min()) > 1.0
-    for compliance in sag.compliances:
-        if compliance.own:
-            used = features[:, columns(sag, compliance)]
-            assert unexplained(used, torques[:, compliance.joint]) < 1e-11
-
-
 def test_lateral_moments_are_linear_in_their_features(weighted: Weighted) -> None:
     sag, q = GravitySag(weighted.arm.nominal), weighted.arm.sample(200)
     features, moments = sag.features(q), weighted.moments(q)
@@ -128,18 +118,6 @@ def test_amounts_are_moments_of_weights_at_the_places(chain: Chain) -> None:
 
 
 # --- twists, features and slopes ----------------------------------------------------------------------------------
-
-
-@every_chain
-def test_twists_are_features_times_coefficients(chain: Chain) -> None:
-    sag, q = GravitySag(chain), draw(6, chain.n)
-    w, features = draw(sag.size, seed=4), sag.features(q)
-    assert features.shape == (6, sag.size)
-    expected = torch.zeros(6, chain.moving, 6, dtype=torch.float64)
-    for compliance in sag.compliances:
-        used = columns(sag, compliance)
-        expected[:, compliance.joint] += (features[:, used] @ w[used])[:, None] * torch.from_numpy(compliance.direction)
-    torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
 
 
 @every_chain
@@ -241,22 +219,3 @@ def test_turning_the_base_turns_the_loads(name: str) -> None:
     vertical = torch.zeros_like(w)
     vertical[2::3] = w[2::3]
     torch.testing.assert_close(other.twists(q, vertical), sag.twists(q, vertical), rtol=1e-12, atol=1e-13)
-
-
-def test_a_vertical_first_axis_carries_no_weight() -> None:
-    arm = SimulatedArm()
-    sag, q = GravitySag(arm.nominal), arm.sample(20)
-    w = draw(sag.size, seed=9)
-    w[sag.components != 2] = 0.0
-    assert float(sag.twists(q, w)[:, 0, 5].abs().max()) < 1e-14
-    assert float(sag.twists(q, w)[:, 1, 4].abs().max()) > 0.1
-
-
-def test_a_slide_is_loaded_along_itself_by_the_force_alone() -> None:
-    chain = CHAINS["gantry"]
-    sag, q = GravitySag(chain), draw(5, 3)
-    w = torch.where(sag.own, draw(sag.size, seed=10), torch.zeros(()).double())
-    twists = sag.twists(q, w)
-    torch.testing.assert_close(twists, twists[:1].expand_as(twists), rtol=0, atol=1e-14)  # slides never turn
-    assert float(twists[..., 3:].abs().max()) == 0.0
-    assert float(twists[..., :3].abs().amax((0, 2)).min()) > 0.01

@@ -64,20 +64,6 @@ def test_one_payload_on_a_branch_is_one_of_the_unknown_masses() -> None:
 
 
 @every_chain
-def test_rows_have_their_own_payloads(chain: Chain) -> None:
-    q, sag = draw(5, chain.n), laden(chain)
-    w = draw(sag.size, seed=3)
-    for row, mass in enumerate(MASSES):
-        alone = laden(chain, mass)
-        for of_rows, of_one in (
-            (sag.features(q), alone.features(q)),
-            (sag.twists(q, w), alone.twists(q, w)),
-            (sag.twist_slopes(q, w), alone.twist_slopes(q, w)),
-        ):
-            torch.testing.assert_close(of_rows[row], of_one[row], rtol=1e-12, atol=1e-13)
-
-
-@every_chain
 def test_derivatives_of_a_laden_robot_against_autograd(chain: Chain) -> None:
     markers = draw(2, 3, seed=6, size=0.1)
     geometry = Geometry.nominal(chain, 2).with_tool(markers)
@@ -132,20 +118,6 @@ def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
     for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
         sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
         assert set(sag.joints[sag.loaded].tolist()) == joints
-
-
-def test_maps_without_payload_answer_for_themselves() -> None:
-    chain = SimulatedArm(0).nominal
-    bare = GeometryMap(Geometry.nominal(chain), elastic=True)
-    rigid = GeometryMap(Geometry.nominal(chain))
-    rows = torch.arange(2)
-    for nominal in (bare, rigid):
-        assert nominal.typical is nominal
-        assert nominal.rows(rows) is nominal
-        assert not nominal.by_row
-    sag = GravitySag(chain)
-    assert list(sag.parts) == ["gravity on joints", "gravity on links"]
-    assert bool(sum(part.int() for part in sag.parts.values()).eq(1).all())  # pyright: ignore
 
 
 def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from simulated_body import URDF_FILE, SimulatedUpperBody
+from simulated_body import URDF_FILE
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -156,21 +156,6 @@ def test_features_are_moments_of_everything_that_a_joint_carries(robot: Tree) ->
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
 
 
-def test_the_other_arm_bends_the_torso() -> None:
-    robot = dc.load_urdf(URDF_FILE, "pelvis", "left_hand", "right_hand")
-    sag, q = GravitySag(robot), draw(robot, 1).repeat(2, 1)
-    elbow = robot.joint_names.index("right_elbow")
-    q[1, elbow] += 0.5
-    changed = {
-        robot.moving_names[c.joint]
-        for c, values in zip(sag.compliances, sag.features(q).split([c.size for c in sag.compliances], 1), strict=True)
-        if not torch.equal(values[0], values[1])
-    }
-    arm = {name for name in robot.moving_names if name.startswith("left")}
-    assert {"waist", "lean", "bend", "upright"} <= changed
-    assert not changed & arm
-
-
 # --- descriptions -------------------------------------------------------------------------------------------------
 
 
@@ -207,14 +192,3 @@ def test_a_chain_is_a_tree() -> None:
 def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: str) -> None:
     with pytest.raises((InputError, RobotError), match=message):
         dc.load_urdf(URDF_FILE, "pelvis", tips, loads)
-
-
-def test_the_simulated_body_sags_by_the_other_arm() -> None:
-    body = SimulatedUpperBody(seed=1)
-    q = body.sample(20)
-    moved = q.clone()
-    moved[:, [body.nominal.joint_names.index(name) for name in ("right_shoulder_pitch", "right_elbow")]] *= -0.5
-    left = (body.true_points(moved) - body.true_points(q))[:, 0].norm(dim=-1)
-    assert float(left.mean()) > 1e-4
-    still = SimulatedUpperBody(seed=1, sag=0.0)
-    torch.testing.assert_close(still.true_points(moved)[:, 0], still.true_points(q)[:, 0], rtol=0, atol=1e-15)

@@ -101,6 +101,11 @@ def test_numbers_off_the_path_are_checked_too(file: Path) -> None:
         load_urdf(file, "base_link", "tool")
 
 
+def one(kind: str = "revolute", inside: str = '<axis xyz="0 0 1"/>') -> str:
+    """A robot of one joint."""
+    return robot(LINKS + joint("j", "base_link", "tool", kind, inside))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -113,37 +118,19 @@ def test_numbers_off_the_path_are_checked_too(file: Path) -> None:
         (robot(LINKS + "<joint name='j'/>"), "has no attribute 'type'"),
         (robot(LINKS + "<joint name='j' type='fixed'><child link='tool'/></joint>"), "joint 'j' in "),
         (robot(LINKS + "<joint name='j' type='fixed'><parent/><child link='tool'/></joint>"), "<parent> of joint 'j'"),
-        (
-            robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="1 0"')),
-            "expected 3 finite numbers, got '1 0'; correct the file",
-        ),
-        (robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="1 0 nan"')), "expected 3 finite numbers"),
-        (robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="${l} 0 0"')), "expand the xacro file first"),
-        (
-            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<limit lower="a" upper="1"/>')),
-            "lower of <limit> of joint 'j'",
-        ),
-        (
-            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" offset="much"/>')),
-            "offset of <mimic> of joint 'j' in ",
-        ),
-        (
-            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" multiplier="inf"/>')),
-            "expected a finite number, got 'inf'; correct the file",
-        ),
+        (robot(LINKS + GOOD.replace("1 0 0", "1 0")), "expected 3 finite numbers, got '1 0'; correct the file"),
+        (robot(LINKS + GOOD.replace("1 0 0", "1 0 nan")), "expected 3 finite numbers"),
+        (robot(LINKS + GOOD.replace("1 0 0", "${l} 0 0")), "expand the xacro file first"),
+        (one(inside='<limit lower="a" upper="1"/>'), "lower of <limit> of joint 'j'"),
+        (one(inside='<mimic joint="k" offset="much"/>'), "offset of <mimic> of joint 'j' in "),
+        (one(inside='<mimic joint="k" multiplier="inf"/>'), "expected a finite number, got 'inf'; correct the file"),
         (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "has two parent joints ('mount' and 'again')"),
-        (robot(LINKS + joint("j", "base_link", "tool", "fixed")), "has no moving joint from 'base_link' to 'tool'"),
-        (robot(LINKS + joint("j", "base_link", "tool", "floating")), "the type of joint 'j' in "),
-        (robot(LINKS + joint("j", "base_link", "tool", "planar")), "got 'planar'; choose a base and a tip"),
-        (robot(LINKS + joint("j", "base_link", "tool", "hinge")), "got 'hinge'"),
-        (
-            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k"/>')),
-            "joint 'j' of robot 'arm' mimics 'k', which is not a joint between 'base_link' and 'tool'; choose a base",
-        ),
-        (
-            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<axis xyz="0 0 0"/>')),
-            "the axis of joint 'j': expected a non-zero vector",
-        ),
+        (one("fixed"), "has no moving joint from 'base_link' to 'tool'"),
+        (one("floating"), "the type of joint 'j' in "),
+        (one("planar"), "got 'planar'; choose a base and a tip"),
+        (one("hinge"), "got 'hinge'"),
+        (one(inside='<mimic joint="k"/>'), "mimics 'k', which is not a joint between 'base_link' and 'tool'; choose a"),
+        (one(inside='<axis xyz="0 0 0"/>'), "the axis of joint 'j': expected a non-zero vector"),
     ],
 )
 def test_bad_files_are_explained(file: Path, text: str, message: str) -> None:
