@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -35,7 +36,7 @@ from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import tip_poses
-from diffeo_calib.runtime.flow import Operations, advanced
+from diffeo_calib.runtime.flow import advanced
 from diffeo_calib.runtime.tables import TURN
 
 OUTPUTS = ("points", "tool_poses", "poses")
@@ -91,12 +92,22 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
     return x + (torch.stack(list(slopes)) * coefficients[: len(slopes), None, None]).sum(0)
 
 
-TORCH = Operations(
-    *(torch.sin, torch.cos, lambda x: x - TURN * torch.floor(x * (1.0 / TURN))),
-    *(torch.stack, torch.cat, torch.ones_like, torch.broadcast_to),
-    *(lambda values, floor: values.clamp(min=floor), lambda name, r2: PROFILES[name].derivative(r2, 0)),
-    *(_cells_around, _combined, twist_transform, _rigid_inverse),
+TORCH = SimpleNamespace(
+    sin=torch.sin,
+    cos=torch.cos,
+    within_turn=lambda x: x - TURN * torch.floor(x * (1.0 / TURN)),
+    stack=torch.stack,
+    concatenate=torch.cat,
+    ones_like=torch.ones_like,
+    broadcast_to=torch.broadcast_to,
+    at_least=lambda values, floor: values.clamp(min=floor),
+    profile=lambda name, r2: PROFILES[name].derivative(r2, 0),
+    cells_around=_cells_around,
+    combined=_combined,
+    transforms=twist_transform,
+    inverse=_rigid_inverse,
 )
+"""See NUMPY in runtime/flow.py."""
 
 
 class _ConstantPoints(Constants):
@@ -143,13 +154,13 @@ class TorchProgram(nn.Module):
     ) -> None:
         super().__init__()
         _check_arguments(model, output, tool, dtype)
-        model = model.to(HOST)
+        model, robot = model.to(HOST), isinstance(model, CalibratedKinematics)
         self.output = output
         self.to_frame: Tensor | None
         self.register_buffer("to_frame", None)
-        deformation = fitted = _exact(model)
-        self.of_robot = isinstance(model, CalibratedKinematics)
-        program, marks = program_of(fitted) if isinstance(model, CalibratedKinematics) else None, None
+        deformation: Any = (model.map if isinstance(model, CalibratedKinematics) else model).deformation
+        self.of_robot = robot
+        program, marks = program_of(deformation) if robot else None, None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
             own = model.tool if tool is None else tool_transform(tool)
             body = ToolKinematics(model.map, model.nominal, own, frame, model.tool_tip)
@@ -199,7 +210,7 @@ def export_torch(
     """
     contents, q = io.BytesIO(), _example(model, dtype)
     with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
-        extra = {DESCRIPTION: json.dumps(description(model, output, frame))}
+        extra = {DESCRIPTION: json.dumps(_description(model, output, frame))}
         torch.export.save(program, contents, extra_files=extra)
         found = program.module()(q)
     expected = model(q.double())
@@ -238,9 +249,24 @@ def export_onnx(
     except ImportError as error:
         what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
         raise InputError.of(what, fix=fix) from error
-    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
-        proto = onnx_model(program, "q", output)
-    for key, value in description(model, output, frame).items():
+    registry = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = registry.level
+    registry.setLevel(logging.ERROR)  # it warns about packages that are not needed
+    try:
+        with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
+            table: Any = {torch.ops.aten.scalar_tensor.default: _exact_scalar}
+            names = {"input_names": ["q"], "output_names": [output], "custom_translation_table": table}
+            found = torch.onnx.export(program, dynamo=True, verbose=False, **names)
+    finally:
+        registry.setLevel(level)
+    proto = cast(torch.onnx.ONNXProgram, found).model_proto
+    graph: Any = proto.graph
+    symbol = graph.input[0].type.tensor_type.shape.dim[0].dim_param  # torch chose it for the number of rows
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        for size in value.type.tensor_type.shape.dim:
+            if symbol in size.dim_param:
+                size.dim_param = size.dim_param.replace(symbol, "rows")
+    for key, value in _description(model, output, frame).items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())
 
@@ -258,8 +284,8 @@ def _recorded(
         yield torch.export.export(module, example, dynamic_shapes=rows, strict=False)
 
 
-def description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:
-    """Description of a program's inputs and outputs, as text by subject."""
+def _description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:
+    """A program's inputs and outputs, as text by subject."""
     found = {"output": output, "units": "m, rad"}
     if isinstance(model, CalibratedKinematics):
         found |= {"robot": model.robot.name, "joints": ", ".join(model.robot.joint_names)}
@@ -287,49 +313,13 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
         raise InputError.of("`tool` was given", expected='output="tool_poses"', got=as_written(output))
     if dtype not in PRECISIONS:
         raise InputError.of("`dtype`", expected="torch.float64 or torch.float32", got=as_written(dtype))
-
-
-def _exact(model: CalibratedKinematics | FittedMap) -> GeodesicDeformation:
-    """The model's deformation."""
     fitted = model.map if isinstance(model, CalibratedKinematics) else model
-    deformation = fitted.deformation
+    deformation, got = fitted.deformation, f"the {fitted.formulation} one"
     if not isinstance(deformation, GeodesicDeformation):
-        fix = 'fit with formulation="exact"'
-        raise InputError.of("`model`", expected="an exact model", got=f"the {fitted.formulation} one", fix=fix)
+        raise InputError.of("`model`", expected="an exact model", got=got, fix='fit with formulation="exact"')
     if not deformation.integrator.replayable:
         got, fix = repr(deformation.integrator), "fit with one of these"
         raise InputError.of("the time stepping of `model`", expected="dc.RK4 or dc.RK8", got=got, fix=fix)
-    return deformation
-
-
-def onnx_model(program: torch.export.ExportedProgram, input_name: str, output_name: str) -> Any:
-    """The model of a program with one input and one output, an ``onnx.ModelProto``; needs onnx and onnxscript."""
-    registry = logging.getLogger("torch.onnx._internal.exporter._registration")
-    level = registry.level
-    registry.setLevel(logging.ERROR)  # it warns about packages that are not needed
-    try:
-        found = torch.onnx.export(
-            program,
-            dynamo=True,
-            verbose=False,
-            input_names=[input_name],
-            output_names=[output_name],
-            custom_translation_table={torch.ops.aten.scalar_tensor.default: _exact_scalar},
-        )
-    finally:
-        registry.setLevel(level)
-    model = cast(torch.onnx.ONNXProgram, found).model_proto
-    _rename_rows(model.graph)
-    return model
-
-
-def _rename_rows(graph: Any) -> None:
-    """Call the number of rows "rows" instead of the symbol that torch chose."""
-    symbol = graph.input[0].type.tensor_type.shape.dim[0].dim_param
-    for value in (*graph.input, *graph.output, *graph.value_info):
-        for size in value.type.tensor_type.shape.dim:
-            if symbol in size.dim_param:
-                size.dim_param = size.dim_param.replace(symbol, "rows")
 
 
 def _exact_scalar(s: float, dtype: int = 1, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:

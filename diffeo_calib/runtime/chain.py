@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffeo_calib.runtime.arrays import ONE, SKEW, Array, cross, skew, transforms
-from diffeo_calib.runtime.flow import NUMPY, Operations
+from diffeo_calib.runtime.flow import NUMPY
 
 COINCIDENT_FRAMES_M = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
@@ -181,7 +181,7 @@ class Masses(NamedTuple):
             directions[number, compliance.joint] = compliance.direction
         axes = np.array([c.axis for c in compliances]).reshape(-1, 3)
         own, arms, slides = np.eye(len(compliances))[:, k], units[place] - units[joint], (place == joint)[:, None]
-        return cls(joints, axes, directions.reshape(len(joints), -1), own, arms, slides.astype(float), SKEW)
+        return cls(joints, axes, directions.reshape(-1, 6 * len(robot.axes)), own, arms, slides.astype(float), SKEW)
 
     def sag(self, coefficients: Any) -> Sag:
         """The sag with these coefficients c (3 M,): m = sum (o_f - o_l) x c for the masses at the places f."""
@@ -251,7 +251,7 @@ class CalibratedChain:
         return tips, found if self.waves is None else found * self.waves.slopes(q)[:, None, None]
 
 
-def tip_poses(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
+def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
     """Poses of the tips: (N, n) -> (N, T, 4, 4) [m].
 
     Args:
@@ -265,13 +265,13 @@ def tip_poses(chain: Any, q: Any, use: Operations = NUMPY) -> Any:
     return ends(chain, link_frames(chain, offsets @ motions), use)
 
 
-def turned(waves: Any, x: Any, use: Operations = NUMPY) -> Any:
+def turned(waves: Any, x: Any, use: Any = NUMPY) -> Any:
     """Joint values with their waves: (N, n) -> (N, n)."""
     angles, (cosine, sine) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
     return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
 
 
-def joint_motions(robot: Any, q: Any, use: Operations = NUMPY) -> Any:
+def joint_motions(robot: Any, q: Any, use: Any = NUMPY) -> Any:
     """J_l of a nominal chain: (N, n_all, 4, 4)."""
     x = (q @ robot.coupling.T + robot.coupling_offset)[..., None, None]
     C, S, D, L = robot.motions
@@ -287,13 +287,13 @@ def link_frames(chain: Any, steps: Any) -> list[Any]:
     return links
 
 
-def ends(chain: Any, links: Sequence[Any], use: Operations = NUMPY) -> Any:
+def ends(chain: Any, links: Sequence[Any], use: Any = NUMPY) -> Any:
     """Poses of the tips on their links: (N, T, 4, 4)."""
     L = len(links) - 1
     return use.stack([links[number + 1] for number in chain.nominal.before[L : L + len(chain.tips)]], 1) @ chain.tips
 
 
-def nominal_frames(robot: Any, motions: Any, use: Operations = NUMPY) -> Any:
+def nominal_frames(robot: Any, motions: Any, use: Any = NUMPY) -> Any:
     """Nominal frames of all places on the ground: (N, F, 4, 4)."""
     poses: list[Any] = []
     for offset, before in zip(robot.offsets, robot.before, strict=True):

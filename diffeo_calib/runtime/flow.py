@@ -6,11 +6,12 @@ of the Runge-Kutta run that moved the controls (flows/geodesic.py).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -133,37 +134,25 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
     return x
 
 
-class Operations(NamedTuple):
-    """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py.
-
-    ``within_turn`` are angles in [0, 2 pi), ``profile`` is a radial function by its name, ``at_least`` the larger of
-    values and a number, ``combined`` the state at a Runge-Kutta stage, ``cells_around`` that of tables.py, ``inverse``
-    of rigid transforms.
-    """
-
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
-    within_turn: Callable[[Any], Any]
-    stack: Callable[[Any, int], Any]
-    concatenate: Callable[[Any, int], Any]
-    ones_like: Callable[[Any], Any]
-    broadcast_to: Callable[[Any, Any], Any]
-    at_least: Callable[[Any, float], Any]
-    profile: Callable[[str, Any], Any]
-    cells_around: Callable[[Any, Any, Any], Any]
-    combined: Callable[[Any, Any, Sequence[Any]], Any]
-    transforms: Callable[[Any], Any]
-    inverse: Callable[[Any], Any]
-
-
-NUMPY = Operations(
-    *(np.sin, np.cos, within_turn, np.stack, np.concatenate, np.ones_like, np.broadcast_to),
-    *(lambda values, floor: np.maximum(values, floor, out=values), lambda name, r2: next(PROFILES[name](r2))),
-    *(cells_around, combined, transforms, np.linalg.inv),
+NUMPY = SimpleNamespace(
+    sin=np.sin,
+    cos=np.cos,
+    within_turn=within_turn,  # angles in [0, 2 pi)
+    stack=np.stack,
+    concatenate=np.concatenate,
+    ones_like=np.ones_like,
+    broadcast_to=np.broadcast_to,
+    at_least=lambda values, floor: np.maximum(values, floor, out=values),
+    profile=lambda name, r2: next(PROFILES[name](r2)),
+    cells_around=cells_around,
+    combined=combined,
+    transforms=transforms,
+    inverse=np.linalg.inv,  # of rigid transforms
 )
+"""Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py."""
 
 
-def advanced(flow: Any, x: Any, use: Operations) -> Any:
+def advanced(flow: Any, x: Any, use: Any) -> Any:
     """The end of the flow of points (N, n), by the constants of a :class:`RecordedFlow` as arrays of a library."""
     for step in range(flow.steps):
         slopes: list[Any] = []
@@ -175,7 +164,7 @@ def advanced(flow: Any, x: Any, use: Operations) -> Any:
     return x
 
 
-def _velocities(flow: Any, stage: int, x: Any, use: Operations) -> Iterator[Any]:
+def _velocities(flow: Any, stage: int, x: Any, use: Any) -> Iterator[Any]:
     """The parts of v_s at points (N, n)."""
     for term in flow.terms:
         yield use.profile(term.profile, squared_distances(term, stage, x, use)[1]) @ term.weights[stage]
@@ -183,7 +172,7 @@ def _velocities(flow: Any, stage: int, x: Any, use: Operations) -> Iterator[Any]
         yield tabulated(flow.tables, stage, x, use.within_turn, use.cells_around)[0] @ flow.tables.selection
 
 
-def squared_distances(term: Any, stage: int, x: Any, use: Operations) -> tuple[Any, Any]:
+def squared_distances(term: Any, stage: int, x: Any, use: Any) -> tuple[Any, Any]:
     """Features F of points: lines about the controls' centre, cosines, sines (N, D); |F - F_j|^2 (N, C)."""
     L, parts = len(term.centre), []
     if L:

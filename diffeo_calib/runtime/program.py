@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from diffeo_calib.runtime.flow import RecordedFlow
 TOOL_LEVER = 0.1
 """Distance of the three points from a tool centre point, m; orientations hardly depend on it."""
 FEW_ROWS = 64
-"""Queries of more rows are limited to one thread."""
+"""Queries of more rows are limited to one thread; fewer use no more, and the limit would take longer than they do."""
 FRAMES = ("base", "measuring")
 """Frames in which poses are given: the robot's base as it was found, or that of the measuring device."""
 MARKS = np.array([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]])
@@ -42,7 +42,7 @@ class Program:
     def points(self, q: Array, points: Array | None = None) -> Array:
         """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""
         points, on = self._placed(points)
-        with _threads(len(q)):
+        with one_thread() if len(q) > FEW_ROWS else nullcontext():
             tip = self.chain.poses(self.joint_flow(q))[:, on]  # (N, P, 4, 4)
             placed = (tip[..., :3, :3] @ points[..., None])[..., 0] + tip[..., :3, 3]
             return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
@@ -54,7 +54,7 @@ class Program:
     def points_and_jacobian(self, q: Array, points: Array | None = None) -> tuple[Array, Array]:
         """Points (N, P, 3) [m] and their derivatives (N, P, 3, n) [m/rad or m/m]."""
         points, on = self._placed(points)
-        with _threads(len(q)):
+        with one_thread() if len(q) > FEW_ROWS else nullcontext():
             xi, M = self.joint_flow.with_jacobian(q)
             tips, slopes = self.chain.poses_and_jacobian(xi)
             tip, slopes = tips[:, on], (slopes @ M[:, None])[:, on]  # (N, P, 4, 4), (N, P, 6, n)
@@ -65,14 +65,7 @@ class Program:
             return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
 
     def poses(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> Array:
-        """Poses of a tool by three points around it.
-
-        Args:
-            q: (N, n). tool: (4, 4) in the tip's frame [m]. frame: one of :data:`FRAMES`.
-            lever: distance of the points from the tool centre point [m].
-
-        Returns (N, 4, 4) [m].
-        """
+        """Poses (N, 4, 4) [m] in a frame of :data:`FRAMES` of a tool (4, 4) in the tip's frame, by points around it."""
         return self._to(frame) @ nearest_poses(self.points(q, tool_points(tool, lever)))
 
     def poses_and_jacobian(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> tuple[Array, Array]:
@@ -80,17 +73,11 @@ class Program:
         points, slopes = self.points_and_jacobian(q, tool_points(tool, lever))
         poses, to_frame = nearest_poses(points), self._to(frame)
         found = pose_slopes(points, slopes, poses[:, :3, :3])
-        R = to_frame[:3, :3]
-        return to_frame @ poses, np.concatenate([R @ found[:, :3], R @ found[:, 3:]], axis=1)
+        return to_frame @ poses, np.kron(np.eye(2), to_frame[:3, :3]) @ found
 
     def _to(self, frame: str) -> Array:
         """(4, 4) from the measuring frame to another one."""
         return np.eye(4) if frame == "measuring" else inverse(self.chain.start)
-
-
-def _threads(rows: int) -> AbstractContextManager[None]:
-    """One thread for many rows; a few use no more in any case, and the limit would take longer than they do."""
-    return one_thread() if rows > FEW_ROWS else nullcontext()
 
 
 def inverse(transform: Array) -> Array:
