@@ -8,13 +8,4 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.tree import Chain
 from diffeo_calib.robots.urdf import load_urdf
 
-__all__ = [
-    "Chain",
-    "DHRow",
-    "Geometry",
-    "Joint",
-    "SimulatedArm",
-    "from_dh",
-    "load_urdf",
-    "with_load",
-]
+__all__ = ["Chain", "DHRow", "Geometry", "Joint", "SimulatedArm", "from_dh", "load_urdf", "with_load"]

@@ -16,13 +16,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import with_joint_offsets
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.rigid import (
-    GEOMETRIC,
-    PROJECTION,
-    best_joint_offsets,
-    nominal_kinematics,
-    rigid_kinematics,
-)
+from diffeo_calib.interop.rigid import GEOMETRIC, PROJECTION, best_joint_offsets, nominal_kinematics, rigid_kinematics
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.robots import Chain, Geometry, simulated_arm
 

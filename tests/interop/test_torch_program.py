@@ -165,10 +165,7 @@ def test_onnx_needs_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_exported_and_read_by_another_process(tmp_path: Path) -> None:
     """One that does not know this package."""
     short, plain = made("one joint", markers=3), fitted_plain("matern52")
-    cases = [
-        (short, {"output": "tool_poses", "tool": TOOL}, lambda q: short.tool_poses(q, TOOL)),
-        (plain, {}, plain),
-    ]
+    cases = [(short, {"output": "tool_poses", "tool": TOOL}, lambda q: short.tool_poses(q, TOOL)), (plain, {}, plain)]
     inputs = [[queries(which)[:1], queries(which), queries(which, 300)] for which, _, _ in cases]
     for k, (which, arguments, _) in enumerate(cases):
         export_torch(which, tmp_path / f"{k}.pt2", **arguments)

@@ -9,16 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from export_bank import (
-    UGLY,
-    UGLY_ENDS,
-    changed_lines,
-    configurations,
-    own_poses,
-    pinocchio_poses,
-    write_ugly,
-    wrong,
-)
+from export_bank import UGLY, UGLY_ENDS, changed_lines, configurations, own_poses, pinocchio_poses, write_ugly, wrong
 from product_bank import Case
 from robots_bank import draw
 

@@ -100,10 +100,7 @@ def test_sensitivities_pass_through_vmap(geometry: Geometry) -> None:
 
 def test_wrong_input_is_explained(chain: Chain) -> None:
     geometry, q, eye = errors_of(chain, 3), torch.zeros(2, 4), torch.eye(4)
-    for theta, message in (
-        (torch.zeros(3), "expected (39,), or one"),
-        (torch.full((39,), torch.nan), "has 39"),
-    ):
+    for theta, message in ((torch.zeros(3), "expected (39,), or one"), (torch.full((39,), torch.nan), "has 39")):
         with pytest.raises(InputError, match=re.escape(message)):
             geometry.points(q, theta)
     with pytest.raises(InputError, match=r"`q` must have shape \(N, 4\)"):

@@ -126,8 +126,5 @@ def test_files_that_are_no_files(tmp_path: Path) -> None:
     os.truncate(large, 200_000_000)  # takes no space
     with pytest.raises(RobotError, match=r"too large for a URDF: expected at most 100 MB"):
         load_urdf(large, "a", "b")
-    with (
-        pytest.warns(dc.DiffeoCalibWarning, match="inf m"),
-        pytest.raises(InputError, match="the origin of joint"),
-    ):
+    with pytest.warns(dc.DiffeoCalibWarning, match="inf m"), pytest.raises(InputError, match="the origin of joint"):
         dc.from_dh([(1e308, 0.0, 0.0)])
