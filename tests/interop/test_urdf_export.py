@@ -16,7 +16,7 @@ from robots_bank import draw
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.urdf import origin_numbers, write_urdf
-from diffeo_calib.robots import Geometry, SimulatedArm
+from diffeo_calib.robots import Geometry
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 
 MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="lift" multiplier="-0.5" offset="0.2"/>')
@@ -170,10 +170,3 @@ def test_two_joints_with_one_name(tmp_path: Path) -> None:
     chain = write_ugly(tmp_path / "robot.urdf", UGLY.replace('name="grip"', 'name="pan"'))
     with pytest.raises(RobotError, match=r"joint 'pan' in the URDF of .*: expected one <joint> with this name, got 2"):
         write_urdf(wrong(chain), tmp_path / "new.urdf")
-
-
-def test_files_that_cannot_be_written(tmp_path: Path) -> None:
-    chain = SimulatedArm().nominal
-    for path in (tmp_path / "none" / "new.urdf", tmp_path):
-        with pytest.raises(InputError, match="cannot be written"):
-            write_urdf(wrong(chain), path)

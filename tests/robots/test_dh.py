@@ -68,29 +68,6 @@ def test_ur10_table_and_urdf_are_one_robot(ur10_folder: Path) -> None:
     torch.testing.assert_close(constant[:, :3, 3], torch.zeros(50, 3, dtype=torch.float64), rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([],), "the DH table is empty"),
-        (([(0, 0, 0)], "modified"), "`convention`: expected 'standard' or 'craig', got 'modified'"),
-        (([(0, 0, 0), (0, 0)],), "row 1 of the DH table: expected (a, alpha, d[, theta[, kind[, mimic"),
-        (([(0, 0, 0, 0, "revolute", None, 0, 0)],), "mimic_offset]]]]), got 8 entries"),
-        (([(0, 0, 0), (0, 0, 0, 0, "revolute", {"elbow": 1})],), "joint 'joint_2' of robot 'robot' mimics 'elbow'"),
-        (([(0, 0, 0), DHRow(0, 0, 0, mimic={"joint_1": nan})],), "the multiplier of 'joint_1' in joint 'joint_2'"),
-        (([(0, nan, 0)],), "row 0 of the DH table: expected finite numbers"),
-        (([DHRow(0, 0, 0, beta=nan)],), "row 0 of the DH table: expected finite numbers"),
-        (([(0, "x", 0)],), "row 0 of the DH table: expected numbers"),
-        (([(0, 0, 0, 0, "ball")],), "the kind in row 0 of the DH table"),
-        (([DHRow(0, 0, 0, 0, "fixed")],), "the kind in row 0 of the DH table"),
-        (([(0, 0, 0)], "standard", ["a", "b"]), "`names`: expected 1 names"),
-        (([(0, 0, 0), (0, 0, 0)], "standard", ["a", "a"]), "several joints named ['a']"),
-    ],
-)
-def test_wrong_tables_are_explained(arguments: tuple, message: str) -> None:
-    with pytest.raises(RobotError, match=re.escape(message)):
-        from_dh(*arguments)
-
-
 def test_angles_beyond_a_turn_are_angles() -> None:
     """As in calibrated tables of makers; degrees are warned about."""
     turned = from_dh([(0.1, 0.3, 0.2), (0.2, 6.50222, 0.1, -6.4)])
@@ -141,43 +118,37 @@ def test_branches_without_a_tip_only_weigh() -> None:
     torch.testing.assert_close(middle[:, 1], robot(q), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("parent", "tips", "words"),
-    [
-        (4, None, "the parent in row 4 of the DH table: expected the number of an earlier row"),
-        (-2, None, "the parent in row 4"),
-        (1.0, None, "the parent in row 4"),
-        (1, {}, "`tips` of the DH table"),
-        (1, {"hand": 7}, "`tips` of the DH table: expected names with numbers of rows, 0 to 6"),
-    ],
-)
-def test_branches_that_cannot_be(parent: object, tips: dict[str, int] | None, words: str) -> None:
-    rows = [*BRANCHED]
-    rows[4] = replace(rows[4], parent=parent)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(RobotError, match=re.escape(words)):
-        from_dh(rows, tips=tips)
-
-
 FORK = [DHRow(0, 0, 0.3), DHRow(0.3, 1.2, 0.1), DHRow(0.3, 0.9, 0.1, parent=0)]
-
-
-@pytest.mark.parametrize("tip", ["joint_3", "base", ""])
-def test_names_of_tips_are_their_own(tip: str) -> None:
-    with pytest.raises(RobotError, match="the name of a tip of the DH table: expected one of its own"):
-        from_dh(FORK, tips={tip: 1})
+ROW = (0, 0, 0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("rows", "arguments", "message"),
     [
-        ({"rows": 5}, "the DH table: expected rows"),
-        ({"rows": [5]}, "row 0 of the DH table: expected"),
-        ({"rows": FORK, "names": 5}, "`names`: expected 3 names, one for each row, got 5"),
-        ({"rows": FORK, "tips": ["x"]}, "`tips` of the DH table: expected names with numbers of rows"),
-        ({"rows": FORK, "tips": {"x": True}}, "`tips` of the DH table"),
-        ({"rows": [FORK[0], DHRow(0, 0, 0.1, parent=False)]}, "the parent in row 1"),
+        ([], {}, "the DH table is empty"),
+        (5, {}, "the DH table: expected rows"),
+        ([5], {}, "row 0 of the DH table: expected"),
+        ([ROW], {"convention": "modified"}, "`convention`: expected 'standard' or 'craig', got 'modified'"),
+        ([ROW, (0, 0)], {}, "row 1 of the DH table: expected (a, alpha, d[, theta[, kind[, mimic"),
+        ([(0, 0, 0, 0, "revolute", None, 0, 0)], {}, "mimic_offset]]]]), got 8 entries"),
+        ([ROW, (0, 0, 0, 0, "revolute", {"elbow": 1})], {}, "joint 'joint_2' of robot 'robot' mimics 'elbow'"),
+        ([ROW, DHRow(0, 0, 0, mimic={"joint_1": nan})], {}, "the multiplier of 'joint_1' in joint 'joint_2'"),
+        ([(0, nan, 0)], {}, "row 0 of the DH table: expected finite numbers"),
+        ([DHRow(0, 0, 0, beta=nan)], {}, "row 0 of the DH table: expected finite numbers"),
+        ([(0, "x", 0)], {}, "row 0 of the DH table: expected numbers"),
+        ([(0, 0, 0, 0, "ball")], {}, "the kind in row 0 of the DH table"),
+        ([DHRow(0, 0, 0, 0, "fixed")], {}, "the kind in row 0 of the DH table"),
+        ([ROW], {"names": ["a", "b"]}, "`names`: expected 1 names"),
+        (FORK, {"names": 5}, "`names`: expected 3 names, one for each row, got 5"),
+        ([ROW, ROW], {"names": ["a", "a"]}, "several joints named ['a']"),
+        *(([ROW, DHRow(*ROW, parent=parent)], {}, "the parent in row 1") for parent in (4, -2, 1.0, False)),
+        (FORK, {"tips": {}}, "`tips` of the DH table"),
+        (FORK, {"tips": {"hand": 7}}, "`tips` of the DH table: expected names with numbers of rows, 0 to 2"),
+        (FORK, {"tips": ["x"]}, "`tips` of the DH table: expected names with numbers of rows"),
+        (FORK, {"tips": {"x": True}}, "`tips` of the DH table"),
+        *((FORK, {"tips": {tip: 1}}, "the name of a tip of the DH table") for tip in ("joint_3", "base", "")),
     ],
 )
-def test_tables_of_another_kind(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(RobotError, match=message):
-        from_dh(**arguments)
+def test_wrong_tables_are_explained(rows: Any, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(RobotError, match=re.escape(message)):
+        from_dh(rows, **arguments)

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping
-from math import inf, nan, pi
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -63,16 +63,6 @@ def test_it_is_the_same_robot_as_one_with_all_joints_active() -> None:
     torch.testing.assert_close(CHAIN.jacobian(q), FREE.jacobian(full) @ CHAIN.coupling, rtol=0, atol=1e-13)
 
 
-def test_a_full_turn_comes_back_only_where_all_mimic_joints_do() -> None:
-    turning = {"waist": "continuous", "twice": "revolute", "half": "revolute"}
-    for follower, multiplier in (("twice", -2.0), ("half", 0.5)):
-        kinds = {name: kind for name, kind in turning.items() if name in ("waist", follower)}
-        chain = build(crooked_joints(kinds), {follower: ({"waist": multiplier}, 0.1)})
-        assert chain.periodic == (True,)  # the joint's own kind
-        q = draw(3, 1)
-        assert torch.allclose(chain(q + 2 * pi), chain(q), rtol=0, atol=1e-13) == (follower == "twice")
-
-
 def slide(name: str, lower: float, upper: float, mimic: Mapping[str, float] | None = None, offset: float = 0) -> Joint:
     return Joint(name, "prismatic", torch.eye(4), torch.ones(3), lower, upper, mimic, offset)
 
@@ -86,13 +76,6 @@ def test_reach_follows_from_the_limits_of_the_drivers() -> None:
     assert Chain("r", "a", "b", [motor, slide("rack", -0.2, 0.3, {"motor": 0.01})]).reach == 0.3
     assert Chain("r", "a", "b", [motor, slide("rack", -inf, inf, {"motor": 0.01})]).reach == inf
     assert Chain("r", "a", "b", [motor, x, slide("y", -9, 9, {"x": 1.0, "motor": 0.0})]).reach == 4.0
-
-
-def test_reach_bounds_the_distance() -> None:
-    lower, upper = CHAIN.limits.clamp(-pi, pi).unbind(1)
-    unit = torch.rand(3000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    distances = CHAIN(lower + (upper - lower) * unit)[:, :3, 3].norm(dim=1)
-    assert distances.max() < CHAIN.reach < 2 * distances.max()
 
 
 # --- bad input ----------------------------------------------------------------------------------------------------
@@ -133,12 +116,6 @@ def test_joints_check_their_mimic(kind: str, mimic: Any, offset: Any, message: s
 def test_chains_check_their_mimic_joints(mimic: Mapping[str, Mapping[str, float]], message: str) -> None:
     with pytest.raises(RobotError, match=re.escape(message)):
         build(crooked_joints(KINDS), {name: (drivers, 0.0) for name, drivers in mimic.items()})
-
-
-def test_two_joints_of_one_name_are_refused() -> None:
-    twice = [Joint("t", "revolute", torch.eye(4)), Joint("t", "revolute", torch.eye(4), mimic={"t": 1.0})]
-    with pytest.raises(RobotError, match=re.escape("several joints named ['t']")):
-        Chain("r", "a", "b", twice)
 
 
 @pytest.mark.parametrize("convention", ["standard", "craig"])

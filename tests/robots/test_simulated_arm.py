@@ -88,11 +88,6 @@ def test_measurements_have_the_stated_noise() -> None:
     torch.testing.assert_close(points, SimulatedArm().true_points(q), rtol=0, atol=0)
 
 
-def test_true_points_are_differentiable() -> None:
-    arm = SimulatedArm()
-    assert torch.autograd.gradcheck(arm.true_points, (arm.sample(2).requires_grad_(),))
-
-
 def test_wrong_options_are_explained() -> None:
     wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
     for options in wrong:

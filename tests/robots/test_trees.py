@@ -12,11 +12,10 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.robots.tree import Chain, Ends, Tree, robot_from_config
+from diffeo_calib.robots.tree import Chain, Tree, robot_from_config
 
 HANDS = ["left_hand", "right_hand"]
 VIEWS = {
@@ -110,13 +109,6 @@ def test_errors_and_sag_have_exact_derivatives(robot: Tree) -> None:
     torch.testing.assert_close(nominal.sensitivities(q, theta), by_theta, rtol=0, atol=1e-13)
 
 
-def test_a_hand_seen_from_the_other_is_the_inverse() -> None:
-    there, back = (dc.load_urdf(URDF_FILE, one, [other]) for one, other in (HANDS, HANDS[::-1]))
-    q = draw(there, 5)
-    order = [there.joint_names.index(name) for name in back.joint_names]
-    torch.testing.assert_close(torch.linalg.inv(there(q)), back(q[:, order]), rtol=0, atol=1e-14)
-
-
 # --- gravity ------------------------------------------------------------------------------------------------------
 
 
@@ -165,18 +157,6 @@ def test_descriptions_come_back(robot: Tree) -> None:
     assert repr(again) == repr(robot)
     q = draw(robot, 4)
     torch.testing.assert_close(again.places(q), robot.places(q), rtol=0, atol=0)
-
-
-def test_a_chain_is_a_tree() -> None:
-    arm = SimulatedArm().nominal
-    parents, last = range(-1, len(arm.joints) - 1), len(arm.joints) - 1
-    tree = Tree(arm.name, arm.base, arm.joints, parents, Ends({arm.tip: last}))
-    q = draw(arm, 5)
-    torch.testing.assert_close(tree(q), arm(q), rtol=0, atol=0)
-    assert tree.serial
-    assert arm.serial
-    for one, other in zip(GravitySag(tree).compliances, GravitySag(arm).compliances, strict=True):
-        assert (one.joint, one.own, one.places) == (other.joint, other.own, other.places)
 
 
 @pytest.mark.parametrize(
