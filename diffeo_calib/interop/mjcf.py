@@ -39,9 +39,7 @@ def write_mjcf(kinematics: CalibratedKinematics | Geometry, path: str | PathLike
     """Write the best rigid kinematics for MuJoCo.
 
     Args:
-        kinematics: a calibrated model, of which the best rigid kinematics are taken (:func:`rigid_kinematics`), or
-            these kinematics themselves.
-        path: the file to write.
+        kinematics: a calibrated model, see :func:`rigid_kinematics`, or a geometry. path: the file to write.
 
     Raises InputError: a base that is not above all other links, a mimic joint that several joints drive, or one that is
     not in the chain, or the file cannot be written. RobotError: masses or inertias in the URDF that are no numbers.

@@ -48,9 +48,8 @@ def write_urdf(
     transmission errors and other deformations cannot be written either.
 
     Args:
-        kinematics: a calibrated model, of which the best rigid kinematics are taken (:func:`rigid_kinematics`), or
-            these kinematics themselves.
-        path: the file to write. robot: the URDF to correct, by default the one that the model was fitted with.
+        kinematics: a calibrated model, see :func:`rigid_kinematics`, or a geometry. path: the file to write.
+        robot: the URDF to correct, by default the one that the model was fitted with.
 
     Raises InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
     RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.

@@ -127,8 +127,7 @@ def walk(start: Tensor, offsets: Tensor, motions: Tensor, parents: Sequence[int]
     """Multiply a tree out: ``frame_l = frame_parent(l) J_parent(l) O_l``, from ``start`` where there is no parent.
 
     Args:
-        start: (4, 4) pose of the base; (N, 4, 4) if it differs between rows.
-        offsets: (F, 4, 4) constant transforms O_l; (F, N, 4, 4) if they differ between rows.
+        start: (4, 4) pose of the base, or (N, 4, 4). offsets: (F, 4, 4) constant transforms O_l, or (F, N, 4, 4).
         motions: (N, n_all, 4, 4) joint motions J_l; the first n_all of the F frames are those of the joints.
         parents: F numbers of the joints before the frames, -1 for the base; a joint follows its parent.
 

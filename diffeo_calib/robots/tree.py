@@ -351,15 +351,9 @@ class Chain(Tree):
     """A serial robot: ``robot(q)`` is the pose of its tip in its base, (N, 4, 4) [m].
 
     Args:
-        name: the robot's name, used in messages.
-        base: name of the frame poses are expressed in.
-        tip: name of the frame whose pose is computed.
-        joints: the joints from base to tip, fixed ones included.
-        drivers: joints off the chain that drive mimic joints of it.
-        source: text of the URDF file that describes the robot, see :class:`Tree`.
-
-    Raises:
-        RobotError: as :class:`Tree`.
+        name: the robot's name, used in messages. base: name of the frame poses are expressed in.
+        tip: name of the frame whose pose is computed. joints: the joints from base to tip, fixed ones included.
+        drivers: joints off the chain that drive mimic joints of it. source, and errors: see :class:`Tree`.
     """
 
     def __init__(
