@@ -14,7 +14,7 @@ n_all moving joints, whose values are an affine function of the active ones, ``c
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -131,7 +131,14 @@ class Tree:
         start = self.tip if tip is None else tip  # several tips have no such name
         if start not in self.tips:
             raise RobotError.of("`tip`", expected=f"one of {', '.join(self.tips)}", got=as_written(tip))
-        joints, parents, last = seen_from(self.ends[start], self.joints, self.parents)
+        way, link = [], self.ends[start]
+        while link != BASE:
+            way.append(link)
+            link = self.parents[link]
+        steps = [(self.joints[number], number, self.parents[number], True) for number in way]
+        every = enumerate(zip(self.joints, self.parents, strict=True))
+        steps += [(joint, parent, number, False) for number, (joint, parent) in every if number not in way]
+        joints, parents, last = along(steps, self.ends[start])
         others = {name: last[self.ends[name]] for name in self.tips if name != start} or {self.base: last[BASE]}
         loads = {name: last[self.ends[name]] for name in self.loads if name not in others}
         loads |= {start: BASE} if last[self.ground] != BASE else {}  # it moves as seen from the ground
@@ -299,10 +306,10 @@ class Tree:
         return q
 
 
-def seen_from(
-    link: int, joints: Sequence[Joint], parents: Sequence[int]
-) -> tuple[list[Joint], list[int], dict[int, int]]:
-    """The same joints with another link as base: those on the way to it run backwards; see :class:`Tree`.
+def along(
+    steps: Iterable[tuple[Joint, Hashable, Hashable, bool]], base: Hashable
+) -> tuple[list[Joint], list[int], dict[Hashable, int]]:
+    """The joints on steps from a base, those that lead up to their parents backwards.
 
     A joint O J(q) from its parent to its link leads back as J(q)^-1 O^-1, a motion about the opposite axis and a
     constant transform. Values, limits and mimic joints stay as they are. The gravity sag has its unknown masses at the
@@ -310,31 +317,21 @@ def seen_from(
     end.
 
     Args:
-        link: the new base, by the number of the joint before it.
-        joints: K joints. parents: numbers of the joints before them, -1 for the base.
+        steps: joint, the links where it starts and ends, whether it leads up. base: the first link.
 
-    Returns the joints, first those from the new base to the old one, their parents, and for every link of the old
-    numbers (-1 for the old base) the number of the last joint before it now, -1 for the new base.
+    Returns the joints, their parents, and for every link the number of the last joint before it, -1 for the base.
     """
-    way, end = [], link
-    while end != BASE:
-        way.append(end)
-        end = parents[end]
-    found: list[Joint] = []
-    before: list[int] = []
-    last, end = {link: BASE}, BASE
-    for number in way:
-        for joint in backwards(joints[number]):
-            found.append(joint)
-            before.append(end)
-            end = len(found) - 1
-        last[parents[number]] = end
-    for number, joint in enumerate(joints):
-        if number not in way:
-            found.append(joint)
-            before.append(last[parents[number]])
-            last[number] = len(found) - 1
-    return found, before, last
+    joints: list[Joint] = []
+    parents: list[int] = []
+    last = {base: BASE}
+    for joint, start, end, up in steps:
+        before = last[start]
+        for one in backwards(joint) if up else [joint]:
+            joints.append(one)
+            parents.append(before)
+            before = len(joints) - 1
+        last[end] = before
+    return joints, parents, last
 
 
 def backwards(joint: Joint) -> list[Joint]:

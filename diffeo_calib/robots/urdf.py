@@ -12,7 +12,7 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
 from diffeo_calib.robots.joint import KINDS, Joint
-from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, backwards
+from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, along
 from diffeo_calib.robots.urdf_elements import LARGEST_FILE, URDF, JointElement, harmless_faults, joint_of
 
 Names = str | Sequence[str]
@@ -157,16 +157,8 @@ class _Paths:
 
     def robot(self, source: str) -> Tree:
         """The robot of these joints."""
-        joints: list[Joint] = []
-        parents, last = [], {self.base: BASE}  # for every link the number of the joint before it
-        for step in self.steps:
-            before = last[step.start]
-            one = joint_of(step.joint, self.urdf.path)
-            for joint in backwards(one) if step.up else [one]:
-                joints.append(joint)
-                parents.append(before)
-                before = len(joints) - 1
-            last[step.end] = before
+        steps = [(joint_of(step.joint, self.urdf.path), step.start, step.end, step.up) for step in self.steps]
+        joints, parents, last = along(steps, self.base)
         name, drivers = self.urdf.name, _drivers(self.urdf, joints)
         if len(self.tips) == 1 and not self.loads and self.top == self.base:
             return Chain(name, self.base, self.tips[0], joints, drivers=drivers, source=source)

@@ -9,7 +9,7 @@ Sums are plain matrices here: they run once per model.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -96,25 +96,15 @@ def _coupling(robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], bet
                     fix = "choose a base and a tip with that joint between them, correct its name, or make it active"
                 raise RobotError.of(what + "fixed" * (driver in fixed), fix=fix)
             slopes[row, place(driver)] = slope
-    by_driver, rows = slopes != 0, start
-    ways = by_driver
-    for _ in mimics:
-        ways, rows = ways @ by_driver, slopes @ rows + start
-    if ways.any():
-        circle = _circle(mimics, {name for name in mimics if ways[place(name)].any()})
-        what = f"joints of robot '{robot['name']}' mimic each other in a circle: {' -> '.join(circle)}"
+    by_driver = (slopes != 0).astype(float)
+    ways = by_driver @ np.linalg.matrix_power(by_driver + np.eye(len(mimics)), len(mimics))  # of any length
+    if circle := [name for name, closed in zip(mimics, ways.diagonal(), strict=True) if closed]:
+        what = f"joints of robot '{robot['name']}' mimic each other in a circle: {', '.join(circle)}"
         raise RobotError.of(what, fix="make one of them active")
+    rows = start
+    for _ in mimics:
+        rows = slopes @ rows + start
     return rows[: len(moving)]
-
-
-def _circle(mimics: Mapping[str, Mapping[str, float]], endless: Collection[str]) -> list[str]:
-    """Names of joints in one circle, closed by the first, among those that lead to one."""
-    path = [next(name for name in mimics if name in endless)]
-    while True:
-        driver = next(name for name in mimics[path[-1]] if name in endless)
-        if driver in path:
-            return [*path[path.index(driver) :], driver]
-        path.append(driver)
 
 
 def calibrated_chain(

@@ -105,12 +105,12 @@ def test_joints_check_their_mimic(kind: str, mimic: Any, offset: Any, message: s
     [
         ({"rail": {"wrist": 1.0}}, "joint 'rail' of robot 'machine' mimics 'wrist', which is not a joint between"),
         ({"rail": {"waist": 1.0, "plate": 1.0}}, "joint 'rail' of robot 'machine' mimics 'plate', which is fixed; mak"),
-        ({"rail": {"rail": 1.0}}, "joints of robot 'machine' mimic each other in a circle: rail -> rail; make one of"),
+        ({"rail": {"rail": 1.0}}, "joints of robot 'machine' mimic each other in a circle: rail; make one of"),
         (
             {"early": {"rail": 1.0}, "rail": {"waist": 1.0, "sum": 1.0}, "sum": {"rack": 1.0}, "rack": {"rail": 1.0}},
-            "mimic each other in a circle: rail -> sum -> rack -> rail; make one of them active.",
+            "mimic each other in a circle: rail, sum, rack; make one of them active.",
         ),
-        ({name: {"waist": 1.0} for name in MOVING}, "mimic each other in a circle: waist -> waist"),
+        ({name: {"waist": 1.0} for name in MOVING}, "mimic each other in a circle: waist; make"),
     ],
 )
 def test_chains_check_their_mimic_joints(mimic: Mapping[str, Mapping[str, float]], message: str) -> None:
