@@ -62,6 +62,10 @@ class CFiles:
         """Bytes of the source."""
         return len(self.texts[0])
 
+    def write(self) -> None:
+        """Write both, or neither; InputError if that is not possible."""
+        write_together(self.contents)
+
 
 def write_c(
     model: CalibratedKinematics,
@@ -92,7 +96,7 @@ def write_c(
     other origin; a prefix that is no name in C.
     """
     files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
-    write_together(files.contents)
+    files.write()
     return files
 
 

@@ -40,22 +40,14 @@ def nominal(x: Tensor) -> Tensor:
 def real(x: Tensor, scale: float = 1.0) -> Tensor:
     """Real kinematics: joint angles (N, 2) [rad] -> tip of the loaded elastic arm (N, 2) [length units].
 
-    The loads act in the directions of the undeformed arm: closed form, smooth, 2 pi periodic.
-
-    Args:
-        x: joint angles.
-        scale: factor on all differences from the nominal arm (errors of lengths, base offset, loads): 0 gives the
-            nominal arm, 1 the paper's.
+    The loads act in the directions of the undeformed arm: closed form, smooth, 2 pi periodic. ``scale`` is a factor on
+    all differences from the nominal arm (errors of lengths, base offset, loads): 0 is the nominal arm, 1 the paper's.
     """
     return real_links(x, scale, samples=1)[..., 1, -1, :]
 
 
 def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
-    """The bent links of the real arm, to draw them.
-
-    Args:
-        x: (N, 2) joint angles [rad]. scale: as in :func:`real`.
-        samples: S, the number of points on each link after its first one.
+    """The bent links of the real arm, to draw them; ``samples``: S points on each link after its first one.
 
     Returns (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
     """

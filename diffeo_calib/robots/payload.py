@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +14,6 @@ from diffeo_calib.common.errors import InputError, MeasurementError, RobotError,
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Ends, Tree
 
-M = TypeVar("M")
 ABSURD, BEYOND = 1000.0, 1.1
 """Masses, relative to the largest of the fit, that are refused and that are warned about."""
 
@@ -168,10 +167,9 @@ def common_mass(first: float | None, second: float | None) -> float | None:
     return 0.0 if first is None or second is None else first
 
 
-def under_mass(model: M, mass: float | None) -> M:
+def under_mass(model: Any, mass: float | None) -> Any:
     """A model that carries a mass; unchanged if it knows of no payload."""
-    carried: Any = model
-    return model if carried.payload is None else carried.with_payload(mass)
+    return model if model.payload is None else model.with_payload(mass)
 
 
 def words_of_mass(mass: float | None) -> str:
