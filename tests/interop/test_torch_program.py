@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from deformation_bank import model_of
 from recorded_bank import bend, fitted_plain, made, made_with, queries
 from robots_bank import CHAINS, draw
 from torch import Tensor
@@ -48,18 +47,6 @@ def test_points_and_tool_poses_of_any_robot(name: str, elastic: bool) -> None:
             same(TorchProgram(model, "tool_poses", frame=frame)(q), model.tool_poses(q, frame=frame))
             found = TorchProgram(model, "tool_poses", tool=TOOL, frame=frame)(q)
             same(found, model.tool_poses(q, TOOL, frame))
-
-
-@pytest.mark.parametrize("profile", ["gaussian", "cauchy", "constant", "matern32", "matern52", "matern72"])
-def test_every_profile_and_several_steps(profile: str) -> None:
-    model = made("mimic slides", profile=profile, steps=2)
-    same(TorchProgram(model)(queries(model)), model.map.deformation(queries(model)).unflatten(1, (1, 3)))
-
-
-def test_waves_of_gears() -> None:
-    model = model_of(CHAINS["arm"], waves=True)
-    q = 5.0 * queries(model)
-    same(TorchProgram(model)(q), model.map.deformation(q).unflatten(1, (2, 3)))
 
 
 def test_poses_of_a_model_of_poses() -> None:

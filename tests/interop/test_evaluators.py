@@ -1,0 +1,275 @@
+"""Models evaluated by NumPy, by torch's programs and by generated C: points, slopes and poses of the torch model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import two_arms_bank
+from c_bank import CModel, needs_compiler
+from deformation_bank import deformation_of, model_of
+from robots_bank import CHAINS, draw, every_chain
+
+import diffeo_calib as dc
+from diffeo_calib.interop import write_c
+from diffeo_calib.interop.c_source import c_source
+from diffeo_calib.interop.torch_program import _ConstantPoints
+from diffeo_calib.kernels.profiles import PROFILES
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.tool import FlangePoints, pose_slopes
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.robots.dh import DHRow
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime import build
+from diffeo_calib.runtime.program import Program
+
+ROWS = 5
+TOOL = twist_transform(draw(6, seed=6)).numpy()
+
+
+def made(deformation: GeodesicDeformation, tip: str | None = None) -> Program:
+    program = program_of(deformation)
+    assert program is not None
+    return program if tip is None else program.at(tip)
+
+
+def c_model(program: Program, folder: Path) -> CModel:
+    """The program in C, in the measuring frame."""
+    n = program.chain.n
+    settings = {"tool": TOOL, "frame": np.eye(4), "limits": np.tile([-np.inf, np.inf], (n, 1))}
+    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
+    for suffix, text in zip((".c", ".h"), c_source(program, "generated", "robot", **settings, **texts), strict=True):
+        (folder / f"generated{suffix}").write_text(text)
+    return CModel(folder / "generated.c", n, len(program.markers), "robot")
+
+
+def agree(
+    by: str, deformation: GeodesicDeformation, folder: Path, tolerance: float = 1e-12, *, tip: str | None = None
+) -> None:
+    """Values to 1e-12, slopes to 1e-9 (the derivative of tables) of the torch model; ``tip``: carries the tool."""
+    program = made(deformation, tip)
+    q = draw(ROWS, program.chain.n, seed=5, size=3.0)
+    expected, expected_slopes = (found.unflatten(1, (-1, 3)) for found in (deformation(q), deformation.jacobian(q)))
+    if by == "torch":
+        near(_ConstantPoints(program)(q).reshape(expected.shape).numpy(), expected.numpy(), tolerance)
+        return
+    model = program if by == "numpy" else c_model(program, folder)
+    points, slopes = model.points_and_jacobian(q.numpy())
+    near(points, expected.numpy(), tolerance)
+    near(slopes, expected_slopes.numpy(), 1e-9)
+    near(model.points(q.numpy()), points, 0.0 if by == "c" else tolerance)
+    if isinstance(model, CModel):
+        near(slopes, program.points_and_jacobian(q.numpy())[1], 1e-10)
+        poses, slopes = model.poses_and_jacobian(q.numpy())
+        expected, expected_slopes = program.poses_and_jacobian(q.numpy(), TOOL, "measuring")
+        near(poses, expected, tolerance)
+        near(slopes, expected_slopes, 1e-9)
+        np.testing.assert_array_equal(model.poses(q.numpy()), poses)
+
+
+def near(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+
+
+def scaled(deformation: GeodesicDeformation, joint: float, task: float, errors: float = 1.0) -> GeodesicDeformation:
+    """With momenta and errors of other size."""
+    b, p, theta = deformation.momenta.tensors
+    momenta = Momenta(joint * b, task * p, errors * theta)
+    return GeodesicDeformation(deformation.spec, deformation.x, momenta, deformation.integrator)
+
+
+def far_away(chain: dc.Chain) -> GeodesicDeformation:
+    """Surveyors' coordinates: kilometres from the origin, where squared distances would cancel."""
+    deformation = deformation_of(chain)
+    nominal = deformation.spec.nominal
+    assert isinstance(nominal, GeometryMap)
+    base = nominal.geometry.base.clone()
+    base[:3, 3] += 1e3
+    spec = replace(deformation.spec, nominal=GeometryMap(replace(nominal.geometry, base=base), elastic=True))
+    return GeodesicDeformation(spec, deformation.x, deformation.momenta, deformation.integrator)
+
+
+CASES: dict[str, Callable[[], GeodesicDeformation]] = {
+    **{f"{name} with sag": lambda chain=chain: deformation_of(chain) for name, chain in CHAINS.items()},
+    **{f"{name}, rigid": lambda chain=chain: deformation_of(chain, elastic=False) for name, chain in CHAINS.items()},
+    **{
+        f"{profile} on {where}": lambda p=profile, chain=CHAINS[robot]: deformation_of(
+            chain, PROFILES[p], integrator=dc.RK8(1)
+        )
+        for profile in PROFILES
+        for robot, where in (("gantry", "lines"), ("arm", "circles"))  # the second in tables
+    },
+    **{
+        f"waves of the {name}": lambda c=CHAINS[name]: deformation_of(c, waves=True) for name in ("arm", "mimic joints")
+    },
+    "no momenta": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 0),
+    "psi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 1),
+    "phi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 1, 0),
+    "waves alone": lambda: scaled(deformation_of(CHAINS["arm"], waves=True), 0, 1),
+    "two steps": lambda: deformation_of(CHAINS["mimic slides"], integrator=dc.RK4(2)),
+    "large sag": lambda: scaled(deformation_of(CHAINS["serial"]), 1, 1, 20.0),  # rotations are no longer a series
+    "far away": lambda: far_away(CHAINS["serial"]),
+}
+QUICK = ("slides with sag", "mimic joints with sag", "mimic slides, rigid", "matern52 on lines", "matern72 on circles")
+QUICK += ("waves of the arm", "waves alone", "psi alone", "phi alone", "no momenta", "large sag", "far away")
+"""Those that are compiled in a default run."""
+
+
+def cases() -> list:
+    found = [pytest.param(by, case) for by in ("numpy", "torch") for case in CASES]
+    slow = {case: [] if case in QUICK else [pytest.mark.slow] for case in CASES}
+    return found + [pytest.param("c", case, marks=[needs_compiler, *slow[case]]) for case in CASES]
+
+
+@pytest.mark.parametrize(("by", "case"), cases())
+def test_points_slopes_and_poses(by: str, case: str, tmp_path: Path) -> None:
+    deformation = CASES[case]()
+    agree(by, deformation, tmp_path, 1e-11 if case in ("large sag", "far away") else 1e-12)
+    flows = made(deformation).joint_flow, made(deformation).task_flow
+    if "alone" in case or case == "no momenta":
+        assert [flow.vanishes for flow in flows] == [case != "phi alone", case in ("phi alone", "no momenta")]
+    if by == "c":
+        text = (tmp_path / "generated.c").read_text()
+        assert [f"{name}_flow" in text for name in ("joint", "task")] == [not flow.vanishes for flow in flows]
+        assert ("add_waves" in text) == ("waves" in case)
+
+
+@needs_compiler
+def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with more controls than are worth tables."""
+    monkeypatch.setattr(build, "MOST_TABULATED", 0)
+    agree("c", deformation_of(CHAINS["mimic slides"]), tmp_path)
+    assert "interpolate" not in (tmp_path / "generated.c").read_text()
+
+
+@every_chain
+def test_tool_poses_by_numpy(chain: dc.Chain) -> None:
+    deformation, tool = deformation_of(chain), torch.from_numpy(TOOL)
+    nominal = deformation.spec.nominal
+    assert isinstance(nominal, GeometryMap)
+    q = draw(ROWS, chain.n, seed=5)
+    other = deformation.with_nominal(FlangePoints(nominal, mark_points(tool[None], 0.2)[0]))
+    points, slopes = other(q).unflatten(1, (3, 3)), other.jacobian(q).unflatten(1, (3, 3))
+    poses, jacobian = made(deformation).poses_and_jacobian(q.numpy(), TOOL, "measuring", 0.2)
+    near(poses, poses_from_marks(points, 0.2).numpy(), 1e-12)
+    near(made(deformation).poses(q.numpy(), TOOL, "measuring", 0.2), poses, 1e-12)
+    near(jacobian, pose_slopes(points, slopes, 0.2).numpy(), 1e-9)
+
+
+def test_maps_without_constant_stages_have_no_program() -> None:
+    assert program_of(deformation_of(CHAINS["arm"], integrator=dc.TorchDiffEq())) is None
+
+
+TREES = {
+    "two arms": lambda robot: robot,
+    "hand to hand": lambda robot: robot.reversed("left"),
+    "slides on a torso": lambda _: dc.from_dh(
+        [
+            (0.1, 0.4, 0.3, 0.0, "prismatic"),
+            (0.2, 0.3, 0.1),
+            (0.3, -0.5, 0.0, 0.2, "prismatic"),
+            DHRow(0.2, 0.7, 0.1, parent=1),
+            DHRow(0.1, 0.2, 0.3, mimic={"j2": 0.5}),
+        ],
+        names=["j1", "j2", "left_slide", "j4", "j5"],
+        tips={"left": 2, "right": 4},
+    ),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["two arms", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TREES)[1:])])
+@pytest.mark.parametrize("tip", [0, -1])
+def test_branches_bend_a_common_torso(name: str, tip: int, tmp_path: Path) -> None:
+    """Every branch weighs on the joints before it; a joint of another branch moves the tip by its sag alone."""
+    robot = TREES[name](two_arms_bank.robot(tmp_path))
+    deformation = deformation_of(robot, integrator=dc.RK4(1))
+    agree("c", deformation, tmp_path, tip=robot.tips[tip])
+    assert "on_path" in (tmp_path / "generated.c").read_text()
+
+
+@needs_compiler
+def test_a_branch_that_only_weighs(tmp_path: Path) -> None:
+    two_arms_bank.robot(tmp_path)
+    robot = dc.load_urdf(tmp_path / "two_arms.urdf", "base", "left", load=["right"])
+    deformation = deformation_of(robot, integrator=dc.RK4(1))
+    agree("c", deformation, tmp_path)
+    slopes = c_model(made(deformation), tmp_path).points_and_jacobian(draw(1, robot.n, seed=5).numpy())[1]
+    assert np.abs(slopes[..., robot.joint_names.index("right_shoulder")]).max() > 1e-6
+
+
+@needs_compiler
+def test_the_tip_of_the_tool_is_named(tmp_path: Path) -> None:
+    model = model_of(two_arms_bank.robot(tmp_path))
+    with pytest.raises(dc.DiffeoCalibError, match="has several tips; name its `tip`"):
+        write_c(model, tmp_path / "m.c")
+    files = write_c(model, tmp_path / "m.c", tip="right")
+    made = CModel(files.source, model.robot.n, 2)
+    q = draw(3, model.robot.n, seed=5)
+    expected = model.tool_poses(q, tip="right", frame="base")
+    near(made.poses(q.numpy()), expected.numpy(), 1e-12)
+    assert "frame of the tip right" in files.header.read_text()
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[dc.CalibratedKinematics, CModel]:
+    """A model of the six-axis arm with its tool in the base frame."""
+    model, path = model_of(CHAINS["arm"]).with_tool(TOOL), tmp_path_factory.mktemp("c") / "arm-1.c"
+    files = write_c(model, path)
+    return model, CModel(files.source, 6, 2, files.prefix)
+
+
+@needs_compiler
+def test_results_in_the_base_frame(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    model, made = arm
+    q = draw(ROWS, 6, seed=5)
+    poses, slopes = made.poses_and_jacobian(q.numpy())
+    near(poses, model.tool_poses(q).numpy(), 1e-12)
+    near(slopes, model.tool_jacobian(q).numpy(), 1e-9)
+    base = model.geometry.base
+    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
+
+
+@needs_compiler
+def test_results_in_the_measuring_frame(tmp_path: Path) -> None:
+    model, q = model_of(CHAINS["serial"]), draw(ROWS, 4, seed=5)
+    files = write_c(model, tmp_path / "m.c", tool=TOOL[:3, 3], frame="measuring", prefix="left_arm")
+    assert files.functions == ("left_arm_markers", "left_arm_tool_pose", "left_arm_newton_step")
+    made = CModel(files.source, 4, 2, files.prefix)
+    near(made.poses(q.numpy()), model.tool_poses(q, TOOL[:3, 3], "measuring").numpy(), 1e-12)
+    near(made.points(q.numpy()), model(q).numpy(), 1e-12)
+
+
+@needs_compiler
+def test_no_numbers_from_none(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    """Joint values that are not finite give results that are not finite, no position of another configuration."""
+    _, made = arm
+    for bad in (np.nan, np.inf, -np.inf):
+        for joint in range(6):
+            q = np.zeros((1, 6))
+            q[0, joint] = bad
+            points, slopes = made.points_and_jacobian(q)
+            assert np.isnan(points).all()
+            assert np.isnan(slopes).any()
+            assert np.isnan(made.poses(q)[0, :3]).all()
+            after, error = made.newton_step(q[0], np.eye(4))
+            assert np.isnan(error)
+            assert np.isnan(after).all()
+
+
+@needs_compiler
+def test_whole_turns(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    """Tables continue periodically, at their ends too."""
+    model, made = arm
+    q = torch.zeros(5, 6, dtype=torch.float64)
+    q[:, 1] = torch.tensor([-1e-17, 0.0, 2 * np.pi, -2 * np.pi, 40.0])
+    near(made.points(q.numpy()), made.points(q.numpy() + 2 * np.pi), 1e-12)
+    base = model.geometry.base
+    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
