@@ -163,6 +163,15 @@ def test_tool_poses_by_numpy(chain: dc.Chain) -> None:
     near(jacobian, pose_slopes(points, slopes, 0.2).numpy(), 1e-9)
 
 
+def test_jacobian_is_the_derivative_of_the_program_itself() -> None:
+    """NumPy and torch share the formulas of gravity sag."""
+    program = made(deformation_of(CHAINS["arm"]))
+    q, step = draw(3, program.chain.n, seed=5).numpy(), 1e-6
+    jacobian = program.points_and_jacobian(q)[1]
+    for joint, e in enumerate(step * np.eye(q.shape[1])):
+        near(jacobian[..., joint], (program.points(q + e) - program.points(q - e)) / (2 * step), 1e-8)
+
+
 def test_maps_without_constant_stages_have_no_program() -> None:
     assert program_of(deformation_of(CHAINS["arm"], integrator=dc.TorchDiffEq())) is None
 
