@@ -27,6 +27,11 @@ def robot(body: str, attributes: str = ' name="r"') -> str:
     return f"<robot{attributes}>{LINKS}{body}</robot>"
 
 
+def turning(inside: str) -> str:
+    """A robot of one joint, with more in it."""
+    return robot(joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/>' + inside))
+
+
 TURN = joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/>')
 Q = torch.tensor([[0.3]], dtype=torch.float64)
 
@@ -45,10 +50,10 @@ def load(folder: Path, content: str | bytes, tip: str = "b") -> dc.Chain:
         ('\n<?xml version="1.0" ?>' + robot(TURN), "ignored an XML declaration that is not at its very beginning"),
         (robot("<!-- a -- b -->" + TURN), "ignored two hyphens inside a comment"),
         (
-            robot(joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/><limit lower="1" upper="-1"/>')),
-            r"ignored the limits of joint 'j' \(lower 1, upper -1\); correct the file if this is wrong",
+            turning('<limit lower="1" upper="-1"/>'),
+            r"the limits of joint 'j' \(lower 1, upper -1\); correct the file if",
         ),
-        (robot(joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/><limit lower="nan" upper="1"/>')), r"lower nan, upper 1"),
+        (turning('<limit lower="nan" upper="1"/>'), r"lower nan, upper 1"),
     ],
 )
 def test_harmless_faults_are_ignored_with_a_warning(content: str, message: str, tmp_path: Path) -> None:
@@ -66,8 +71,8 @@ def test_harmless_faults_are_ignored_with_a_warning(content: str, message: str, 
         '<?xml version="1.0" encoding="utf-16"?>'.encode("utf-16") + robot(TURN).encode("utf-16-le"),
         robot(TURN, ' name="r" xmlns="http://drake.mit.edu" xmlns:xacro="http://www.ros.org/wiki/xacro"'),
         robot("<sensor:camera/><material name='m'/><material name='m'/><gazebo/><transmission/>" + TURN),
-        robot(joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/><limit lower="-inf" upper="inf"/>')),
-        robot(joint('<origin xyz="0 0 1"/><axis xyz="0 1 0"/><limit effort="1"/>')),
+        turning('<limit lower="-inf" upper="inf"/>'),
+        turning('<limit effort="1"/>'),
         robot(joint('<origin xyz="0 0 1"/><axis xyz="0 3e-200 0"/>')),  # its square is not representable
     ],
 )
