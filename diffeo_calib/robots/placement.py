@@ -138,7 +138,10 @@ def _solved(sightings: _Sightings, weight: float) -> Placement:
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
-    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps."""
+    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps.
+
+    Gauss-Newton alone needs a hundred steps where the residuals are large: rows that do not belong to the robot.
+    """
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
     B = torch.cat([nearest_rotations(linear)[None], factor.new_tensor(Rotation.create_group("O").as_matrix())])
