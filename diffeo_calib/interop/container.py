@@ -34,7 +34,15 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     """
     if not path.is_file():
         raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
-    _check_beginning(path)
+    unreadable, written = f"{path} cannot be read as a model file", "pass a file written by `save` or `fit -o`"
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(9)  # eight bytes of length, then a JSON header
+    except OSError as error:
+        raise ModelFileError.of(f"{unreadable} ({error.strerror})", fix="pass the name of a readable file") from error
+    if len(beginning) == 9 and beginning[8:] != b"{":  # what is cut short has its own sentence
+        kind = "a URDF" if path.suffix.lower() in (".urdf", ".xml", ".xacro") else "another kind of file"
+        raise ModelFileError.of(f"{unreadable}: it is {kind}", fix=written)
     try:
         with safe_open(path, framework="np") as file:
             text = (file.metadata() or {}).get(ENTRY)
@@ -43,9 +51,9 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
         sealed = isinstance(header, dict) and header.pop("digest", None) == digest(header, arrays)
     except (SafetensorError, OSError, *UNSOUND) as error:
         fix = "it is damaged or cut short: copy or save it again"
-        raise ModelFileError.of(f"{path} cannot be read as a model file ({error})", fix=fix) from error
+        raise ModelFileError.of(f"{unreadable} ({error})", fix=fix) from error
     if not isinstance(header, dict):
-        raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
+        raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix=written)
     if header.get("format") != FORMAT:
         what, fix = f"{path} has format version {header.get('format')!r}", "read it with the version that wrote it"
         raise ModelFileError.of(what, expected=FORMAT, fix=fix)
@@ -53,21 +61,6 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
         what = f"{path} was damaged or edited: its checksum does not match"
         raise ModelFileError.of(what, fix="save the model again")
     return header, arrays
-
-
-def _check_beginning(path: Path) -> None:
-    """Refuse a file that never was a model: eight bytes of length, then a JSON header."""
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(9)
-    except OSError as error:
-        what = f"{path} cannot be read as a model file ({error.strerror})"
-        raise ModelFileError.of(what, fix="pass the name of a readable file") from error
-    if len(beginning) < 9 or beginning[8:] == b"{":
-        return  # what is cut short has its own sentence
-    kind = "a URDF" if path.suffix.lower() in (".urdf", ".xml", ".xacro") else "another kind of file"
-    what, fix = f"{path} cannot be read as a model file: it is {kind}", "pass a file written by `save` or `fit -o`"
-    raise ModelFileError.of(what, fix=fix)
 
 
 def digest(header: Header, arrays: Mapping[str, Any]) -> str:

@@ -12,9 +12,8 @@ try:
     from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError as error:  # scikit-learn, or one that is too old
-    raise ImportError(
-        "DiffeoRegressor needs scikit-learn 1.6 or newer: pip install 'diffeo_calib[notebooks]'"
-    ) from error
+    what = "DiffeoRegressor needs scikit-learn 1.6 or newer: pip install 'diffeo_calib[notebooks]'"
+    raise ImportError(what) from error
 
 from diffeo_calib.calibration.calibrate import Controls, calibrate
 from diffeo_calib.calibration.result import CalibrationResult
@@ -33,8 +32,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     X is (N, n), rad or m, columns in the robot's order; a data frame has columns named after the joints, in any order,
     but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden.
-    ``score`` is R^2,
-    as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
+    ``score`` is R^2, as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
 
     Args:
         robot: nominal chain of n joints. on: names of the tips that carry the markers, for a robot with several.
