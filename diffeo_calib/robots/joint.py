@@ -7,7 +7,7 @@ through. The value of a mimic joint is an affine function of the values of activ
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite, isnan
 from typing import Any
@@ -121,25 +121,6 @@ def _finite_number(value: Any, what: str) -> float:
         expected = f"a number of at most {LARGEST_OFFSET:g}" if isfinite(number) else "a finite number"
         raise RobotError.of(what, expected=expected, got=as_written(value), fix="correct it")
     return number
-
-
-def walk(start: Tensor, offsets: Tensor, motions: Tensor, parents: Sequence[int]) -> Tensor:
-    """Multiply a tree out: ``frame_l = frame_parent(l) J_parent(l) O_l``, from ``start`` where there is no parent.
-
-    Args:
-        start: (4, 4) pose of the base, or (N, 4, 4). offsets: (F, 4, 4) constant transforms O_l, or (F, N, 4, 4).
-        motions: (N, n_all, 4, 4) joint motions J_l; the first n_all of the F frames are those of the joints.
-        parents: F numbers of the joints before the frames, -1 for the base; a joint follows its parent.
-
-    Returns frames (N, F, 4, 4); those of joints are before the joint's motion.
-    """
-    base = start.expand(motions.shape[0], 4, 4)
-    steps, moved, frames = motions.unbind(1), {-1: base}, []
-    for number, (offset, parent) in enumerate(zip(offsets.unbind(0), parents, strict=True)):
-        frames.append(moved[parent] @ offset)
-        if number < len(steps):
-            moved[number] = frames[-1] @ steps[number]
-    return torch.stack(frames, dim=1)
 
 
 def joint_motions(terms: Tensor, q: Tensor) -> Tensor:

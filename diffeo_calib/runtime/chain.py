@@ -293,13 +293,28 @@ def ends(chain: Any, links: Sequence[Any], use: Any = NUMPY) -> Any:
     return use.stack([links[number + 1] for number in chain.nominal.before[L : L + len(chain.tips)]], 1) @ chain.tips
 
 
+def walk(start: Any, offsets: Any, motions: Any, before: Sequence[int], use: Any = NUMPY) -> Any:
+    """Multiply a tree out: ``frame_f = frame_before(f) J_before(f) O_f``, from ``start`` where nothing is before.
+
+    Args:
+        start: (4, 4) pose of the base, or (N, 4, 4); None for the base itself. offsets: F of (4, 4), or (N, 4, 4).
+        motions: (N, n_all, 4, 4) joint motions J_l; the first n_all of the F frames are those of the joints.
+        before: F numbers of the joints before the frames, -1 for the base; a joint follows its parent.
+
+    Returns frames (N, F, 4, 4); those of joints are before the joint's motion.
+    """
+    shape, steps, frames = motions[:, 0].shape, list(motions.swapaxes(0, 1)), []
+    moved = {} if start is None else {-1: use.broadcast_to(start, shape)}
+    for number, (offset, parent) in enumerate(zip(offsets, before, strict=True)):
+        frames.append(moved[parent] @ offset if parent in moved else use.broadcast_to(offset, shape))
+        if number < len(steps):
+            moved[number] = frames[-1] @ steps[number]
+    return use.stack(frames, 1)
+
+
 def nominal_frames(robot: Any, motions: Any, use: Any = NUMPY) -> Any:
     """Nominal frames of all places on the ground: (N, F, 4, 4)."""
-    poses: list[Any] = []
-    for offset, before in zip(robot.offsets, robot.before, strict=True):
-        on_base = use.broadcast_to(offset, motions[:, 0].shape)
-        poses.append(on_base if before < 0 else poses[before] @ motions[:, before] @ offset)
-    found = use.stack(poses, 1)
+    found = walk(None, robot.offsets, motions, robot.before, use)
     return use.inverse(found[:, -1:]) @ found if robot.grounded else found
 
 
