@@ -20,11 +20,10 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
-from diffeo_calib.runtime.chain import perpendicular
+from diffeo_calib.runtime.chain import joint_motions, perpendicular
 
 URDF_FILE = Path(__file__).with_name("simulated_upper_body.urdf")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -100,7 +99,7 @@ class SimulatedUpperBody:
         """True twists of the joints' frames by gravity: (N, 17) -> (N, 18, 6) [m, rad]."""
         robot, count = self.nominal, self.nominal.moving
         places = robot.places(q)[:, :count]
-        links = places @ joint_motions(robot.motion_terms, robot.moving_values(q))
+        links = places @ joint_motions(robot.motion_terms, robot.moving_values(q), torch)
         centres = (links[..., :3, :3] @ self._centres[..., None]).squeeze(-1) + links[..., :3, 3]
         weights = self._masses[:, None] * torch.tensor(GRAVITY, dtype=q.dtype, device=q.device)  # (L, 3) [N]
         arms = centres[:, None] - places[:, :, None, :3, 3]  # (N, joint, link, 3)

@@ -29,10 +29,9 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import right_jacobian, rigid, twist_transform
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.runtime.chain import walk
+from diffeo_calib.runtime.chain import joint_motions, walk
 
 
 @methods_outside_inference_mode
@@ -169,7 +168,7 @@ class Geometry:
         ends = chain.tip_offsets.to(device)
         offsets = (chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[..., 1:, :, :]).movedim(-3, 0)
         ends = ends[:, None].expand(-1, q.shape[0], 4, 4) if offsets.ndim > 3 else ends
-        motions = joint_motions(chain.motion_terms.to(device), chain.moving_values(q))
+        motions = joint_motions(chain.motion_terms.to(device), chain.moving_values(q), torch)
         places = walk(start, torch.cat([offsets, ends]), motions, chain.before[:count], torch)
         tips, tool = places[:, self.tip_places.to(device)], self.tool.to(device) + shifts
         points = (tips[..., :3, :3] @ tool[..., None]).squeeze(-1) + tips[..., :3, 3]

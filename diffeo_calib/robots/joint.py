@@ -1,4 +1,4 @@
-"""Joints of a robot: frame, axis and limits; their motions and the product of these along a tree; mimic joints.
+"""Joints of a robot: frame, axis and limits; mimic joints. Their motions are in runtime/chain.py.
 
 Every motion is ``J_l(q) = C + S sin q + D cos q + L q`` with constant 4 x 4 matrices (Rodrigues for a rotation, ``L``
 for a slide), so that neither values nor types of joints are branched on: autograd, ``torch.func`` and ``vmap`` all pass
@@ -121,13 +121,6 @@ def _finite_number(value: Any, what: str) -> float:
         expected = f"a number of at most {LARGEST_OFFSET:g}" if isfinite(number) else "a finite number"
         raise RobotError.of(what, expected=expected, got=as_written(value), fix="correct it")
     return number
-
-
-def joint_motions(terms: Tensor, q: Tensor) -> Tensor:
-    """Joint motions ``C + S sin q + D cos q + L q``: terms (4, n, 4, 4), q (N, n) -> (N, n, 4, 4)."""
-    constant, sine, cosine, slope = terms
-    x = q[..., None, None]
-    return constant + torch.sin(x) * sine + torch.cos(x) * cosine + x * slope
 
 
 def turned_axes(frames: Tensor, axes: Tensor) -> Tensor:

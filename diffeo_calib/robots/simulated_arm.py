@@ -28,10 +28,11 @@ from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.joint import joint_motions, turned_axes
+from diffeo_calib.robots.joint import turned_axes
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.runtime.chain import joint_motions
 
 URDF_FILE = Path(__file__).with_name("simulated_arm.urdf")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -120,7 +121,7 @@ class SimulatedArm:
         q = self.nominal.joint_values(q)
         frames = self.nominal.joint_frames(q)
         axes, origins = turned_axes(frames, self.nominal.axes), frames[..., :3, 3]  # (N, n, 3)
-        links = frames @ joint_motions(self.nominal.motion_terms.to(q.device), q)  # a link moves with its joint
+        links = frames @ joint_motions(self.nominal.motion_terms.to(q.device), q, torch)  # a link moves with its joint
         centres = (links[..., :3, :3] @ self._centres.to(q.device)[..., None])[..., 0] + links[..., :3, 3]
         payload_centre = torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device=q.device)
         held = links[:, -1] @ (self.nominal.tip_offsets[0].to(q.device) @ payload_centre)

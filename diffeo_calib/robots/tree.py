@@ -27,10 +27,10 @@ from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import InputError, RobotError, as_written
-from diffeo_calib.robots.joint import Joint, joint_motions, turned_axes
+from diffeo_calib.robots.joint import Joint, turned_axes
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.runtime.build import ROTARY, nominal_chain
-from diffeo_calib.runtime.chain import walk
+from diffeo_calib.runtime.chain import joint_motions, walk
 
 BASE = -1
 """Stands for the base where the number of a joint is asked for."""
@@ -243,7 +243,7 @@ class Tree:
     def places(self, q: Tensor) -> Tensor:
         """Poses in the base of all F places: joints' frames, tips, loads and the ground: (N, F, 4, 4) [m]."""
         q = self.joint_values(q)
-        motions = joint_motions(self.motion_terms.to(q.device), self.moving_values(q))
+        motions = joint_motions(self.motion_terms.to(q.device), self.moving_values(q), torch)
         return walk(None, self.place_offsets.to(q.device), motions, self.before, torch)
 
     def jacobian(self, q: Tensor) -> Tensor:

@@ -224,7 +224,8 @@ class CalibratedChain:
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
         robot, L = self.nominal, len(self.nominal.axes)
-        motions = joint_motions(robot, q if self.waves is None else turned(self.waves, q))
+        at = q if self.waves is None else turned(self.waves, q)
+        motions = joint_motions(robot.motions, moving_values(robot, at))
         nominal = None if self.sag is None else nominal_frames(robot, motions)
         twists = self.twists[None] if nominal is None else error_twists(self, nominal)
         offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
@@ -258,7 +259,8 @@ def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
         chain: the constants of a :class:`CalibratedChain`, as arrays of the library. q: joint values.
         use: the library; NumPy by default.
     """
-    motions = joint_motions(chain.nominal, q if chain.waves is None else turned(chain.waves, q, use), use)
+    at = q if chain.waves is None else turned(chain.waves, q, use)
+    motions = joint_motions(chain.nominal.motions, moving_values(chain.nominal, at), use)
     offsets = chain.offsets
     if chain.sag is not None:
         offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.nominal, motions, use)))
@@ -271,12 +273,15 @@ def turned(waves: Any, x: Any, use: Any = NUMPY) -> Any:
     return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
 
 
-def joint_motions(robot: Any, q: Any, use: Any = NUMPY) -> Any:
-    """J_l of a nominal chain: (N, n_all, 4, 4)."""
-    x = (q @ robot.coupling.T + robot.coupling_offset)[..., None, None]
-    C, S, D, L = robot.motions
-    motions = C + S * use.sin(x) + D * use.cos(x)
-    return motions if all(robot.revolute) else motions + L * x
+def joint_motions(terms: Any, values: Any, use: Any = NUMPY) -> Any:
+    """J_l = C + S sin q + D cos q + L q: terms (4, n_all, 4, 4), moving joints' q (N, n_all) -> (N, n_all, 4, 4)."""
+    (C, S, D, L), x = terms, values[..., None, None]
+    return C + S * use.sin(x) + D * use.cos(x) + L * x
+
+
+def moving_values(robot: Any, q: Any) -> Any:
+    """Values of all moving joints (N, n_all) from those of the active ones (N, n), rad or m."""
+    return q @ robot.coupling.T + robot.coupling_offset
 
 
 def link_frames(chain: Any, steps: Any) -> list[Any]:

@@ -11,9 +11,8 @@ from torch import Tensor
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 from diffeo_calib.robots.gravity import GravitySag
-from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.chain import Compliance
+from diffeo_calib.runtime.chain import Compliance, joint_motions
 
 UPRIGHT, ON_A_WALL = (0.0, 0.0, -9.81), (-6.0, 2.0, 5.0)
 
@@ -52,7 +51,7 @@ def test_moments_of_weights_are_linear_in_their_features(gravity: tuple[float, f
     ends = torch.cat([chain.offsets[1:], chain.tip_offsets[0][None]])[:, :3, 3]
     centres = torch.linspace(0.2, 1.0, 6, dtype=torch.float64)[:, None] * ends
     frames = chain.joint_frames(q)
-    links = frames @ joint_motions(chain.motion_terms, q)
+    links = frames @ joint_motions(chain.motion_terms, q, torch)
     places = (links[..., :3, :3] @ centres[..., None])[..., 0] + links[..., :3, 3]
     sag, seen = GravitySag(chain), 0
     features = sag.features(q)
