@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.runtime.chain import Waves, turned, wave_slopes
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,12 @@ class GearWaves:
 
     def turned(self, x: Tensor, coefficients: Tensor) -> Tensor:
         """The joint values with their waves: (N, n) -> (N, n)."""
-        return x + self._by_joint(x, coefficients)
+        return turned(self._waves(x, coefficients), x, torch)
 
     def slopes(self, x: Tensor, coefficients: Tensor) -> Tensor:
         """Derivative of :meth:`turned`, which is diagonal: (N, n) -> (N, n)."""
-        C, S = x.new_tensor(self.frequencies) * coefficients.view(-1, 2).mT
-        return 1.0 + self._by_joint(x, torch.stack([S, -C], 1).flatten())
+        return wave_slopes(self._waves(x, coefficients), x, torch)
 
-    def _by_joint(self, x: Tensor, coefficients: Tensor) -> Tensor:
+    def _waves(self, x: Tensor, coefficients: Tensor) -> Waves:
         own = torch.nn.functional.one_hot(torch.tensor(self.joints, dtype=torch.int64, device=x.device), x.shape[1])
-        return (self.columns(x) * coefficients) @ own.to(x.dtype).repeat_interleave(2, 0)
+        return Waves(self.joints, own.to(x.dtype), x.new_tensor(self.frequencies), coefficients.view(-1, 2))

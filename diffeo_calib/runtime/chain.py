@@ -26,32 +26,36 @@ SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
 
-@dataclass(frozen=True, eq=False)
-class Waves:
-    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; see robots/gear_waves.py."""
+class Waves(NamedTuple):
+    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; arrays of any library."""
 
     joints: tuple[int, ...]  # (K,) numbers l
-    selection: Array  # (K, n) units of these joints: several waves of one joint add up
-    frequencies: Array  # (K,) w, periods per turn
-    coefficients: Array  # (K, 2) C and S, rad or m
-
-    def slopes(self, x: Array) -> Array:
-        """Derivative of :func:`turned`, which is diagonal: (N, n) -> (N, n)."""
-        angles, (cosine, sine) = x[:, list(self.joints)] * self.frequencies, self.coefficients.T
-        return 1.0 + (self.frequencies * (np.cos(angles) * sine - np.sin(angles) * cosine)) @ self.selection
+    selection: Any  # (K, n) units of these joints: several waves of one joint add up
+    frequencies: Any  # (K,) w, periods per turn
+    coefficients: Any  # (K, 2) C and S, rad or m
 
 
 def waves_of(config: Sequence[Sequence[float]], size: int, coefficients: Array) -> Waves | None:
-    """The waves that a model file describes; None without any.
+    """The waves, joint and frequency of each, that a model file describes; None without any.
 
     Args:
-        config: joint and frequency of each. size: number of joints. coefficients: (2 K,).
+        size: number of joints. coefficients: (2 K,).
     """
-    if not config:
-        return None
     joints = tuple(int(joint) for joint, _ in config)
     frequencies = np.array([frequency for _, frequency in config], dtype=np.float64)
-    return Waves(joints, np.eye(size)[list(joints)], frequencies, coefficients.reshape(-1, 2))
+    return Waves(joints, np.eye(size)[list(joints)], frequencies, coefficients.reshape(-1, 2)) if config else None
+
+
+def turned(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
+    """Joint values with their waves: (N, n) -> (N, n)."""
+    angles, (C, S) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
+    return x + (use.cos(angles) * C + use.sin(angles) * S) @ waves.selection
+
+
+def wave_slopes(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
+    """Derivative of :func:`turned`, which is diagonal: (N, n) -> (N, n)."""
+    angles, (C, S) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
+    return 1.0 + (waves.frequencies * (use.cos(angles) * S - use.sin(angles) * C)) @ waves.selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +253,7 @@ class CalibratedChain:
             sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
             by_moving = by_moving + np.concatenate(sums, axis=2)
         found = by_moving @ robot.coupling
-        return tips, found if self.waves is None else found * self.waves.slopes(q)[:, None, None]
+        return tips, found if self.waves is None else found * wave_slopes(self.waves, q)[:, None, None]
 
 
 def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
@@ -265,12 +269,6 @@ def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
     if chain.sag is not None:
         offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.nominal, motions, use)))
     return ends(chain, link_frames(chain, offsets @ motions), use)
-
-
-def turned(waves: Any, x: Any, use: Any = NUMPY) -> Any:
-    """Joint values with their waves: (N, n) -> (N, n)."""
-    angles, (cosine, sine) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
-    return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
 
 
 def joint_motions(terms: Any, values: Any, use: Any = NUMPY) -> Any:
