@@ -88,11 +88,7 @@ class DHFile:
             expected = "standard or craig (modified), in one place"
             raise RobotError.of(f"'{path}' names two conventions", expected=expected)
         own = {_what(cell): found[1].lower().replace("°", "deg") for cell in header if (found := UNIT.search(cell))}
-        units = _likely_units(rows) | own
-        if not units["alpha"] or not units["theta"]:
-            what, fix = f"the unit of angles of '{path}'", "write it into the header: alpha [deg], theta [deg]"
-            raise RobotError.of(what, expected="rad or deg", got="numbers that may be either", fix=fix)
-        units |= _units_of_values(path, rows, units)
+        units = _units(path, rows, own)
         names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
         names = [f"joint_{name}" if name.isdecimal() else name for name in names]
         table = [_row(row, units, f"joint '{shown(name)}' of '{path}'") for name, row in zip(names, rows, strict=True)]
@@ -179,41 +175,41 @@ def _mention(lines: Sequence[str], words: str) -> bool:
     return any(re.search(f"(?<![a-z])({words})(?![a-z])", line, re.IGNORECASE) for line in lines)
 
 
-def _likely_units(rows: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """Units by size, empty if unclear: no link is longer than 20 m, and most axes are at right angles."""
+def _units(path: Path, rows: Sequence[Mapping[str, str]], own: Mapping[str, str]) -> dict[str, str]:
+    """Units of all columns, by size where the header has none.
+
+    No link is longer than 20 m, and most axes are at right angles. Raises RobotError: angles that may be in rad or deg;
+    small limits or offsets of joints that turn beside angles in degrees, which may be either.
+    """
     a, d, alpha, theta = ([_number(row, what) for row in rows] for what in ("a", "d", "alpha", "theta"))
     length = max(map(abs, a))
     if length <= LONGEST_LINK_M:  # of axes that are nearly parallel two d of hundreds of metres nearly cancel
         length = min(abs(sum(d)), max(map(abs, d)))
     angles, texts = [*map(abs, alpha + theta)], " ".join(row.get(k, "") for row in rows for k in ("alpha", "theta"))
-    angle = "" if any(angles) else "rad"
-    if "pi" in texts.lower() or any(abs(value - turn) < RIGHT_ANGLE_RAD for value in angles for turn in (pi / 2, pi)):
-        angle = "rad"
-    if "°" in texts or max(angles) > LARGEST_ANGLE_RAD:
-        angle = "deg"
+    angle = "rad" if "pi" in texts.lower() or not any(angles) or _right(angles) else ""
+    angle = "deg" if "°" in texts or max(angles) > LARGEST_ANGLE_RAD else angle
     lengths = dict.fromkeys(("a", "d"), "mm" if length > LONGEST_LINK_M else "m")
-    return lengths | dict.fromkeys(("alpha", "theta", "beta"), angle)
-
-
-def _units_of_values(path: Path, rows: Sequence[Mapping[str, str]], units: Mapping[str, str]) -> dict[str, str]:
-    """Units of limits and of offsets of joints that turn, where the header has none: by their own size."""
-    found = dict[str, str]()
-    for names in (("lower", "upper"), ("offset",)):
-        turning = [row for row in rows if _kind(row) == "revolute"]
+    units = lengths | dict.fromkeys(("alpha", "theta", "beta"), angle) | dict(own)
+    if not units["alpha"] or not units["theta"]:
+        what, fix = f"the unit of angles of '{path}'", "write it into the header: alpha [deg], theta [deg]"
+        raise RobotError.of(what, expected="rad or deg", got="numbers that may be either", fix=fix)
+    turning = [row for row in rows if _kind(row) == "revolute"]
+    for column, names in (("min", ("lower", "upper")), ("offset", ("offset",))):
         cells = [(row, name) for row in turning for name in names if "pi" not in row.get(name, "").lower()]
         sizes = [size for row, name in cells if isfinite(size := abs(_number(row, name))) and size]
-        stated = next((units[name] for name in names if name in units), "")
-        if stated or not sizes:
-            found |= dict.fromkeys(names, stated) if stated else {}
-            continue
-        unit = "deg" if max(sizes) > LARGEST_ANGLE_RAD else "rad"
-        right = any(abs(size - turn) < RIGHT_ANGLE_RAD for size in sizes for turn in (pi / 2, pi))
-        if unit == "rad" and units["theta"] == "deg" and not right:
-            column, got = "min" if len(names) > 1 else "offset", f"at most {max(sizes):g}, with angles in deg"
-            fix = f"write {column} [rad] or {column} [deg]"
-            raise RobotError.of(f"the unit of `{column}` of '{path}'", expected="rad or deg", got=got, fix=fix)
-        found |= dict.fromkeys(names, unit)
-    return found
+        unit = next((own[name] for name in names if name in own), "")
+        if sizes and not unit:
+            unit = "deg" if max(sizes) > LARGEST_ANGLE_RAD else "rad"
+            if unit == "rad" and units["theta"] == "deg" and not _right(sizes):
+                got, fix = f"at most {max(sizes):g}, with angles in deg", f"write {column} [rad] or {column} [deg]"
+                raise RobotError.of(f"the unit of `{column}` of '{path}'", expected="rad or deg", got=got, fix=fix)
+        units |= dict.fromkeys(names, unit) if unit else {}
+    return units
+
+
+def _right(sizes: Sequence[float]) -> bool:
+    """Whether one is a right angle, or two, in rad."""
+    return any(abs(size - turn) < RIGHT_ANGLE_RAD for size in sizes for turn in (pi / 2, pi))
 
 
 def _kind(row: Mapping[str, str]) -> str:
