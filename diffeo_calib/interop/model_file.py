@@ -10,6 +10,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save as safetensors
@@ -89,7 +90,7 @@ def load(
 
 def _checked(kernels: object) -> KernelClasses:
     """Classes of kernels, and profiles whose derivatives are right, of classes without arguments, by their names."""
-    given = {} if kernels is None else dict(kernels) if isinstance(kernels, Mapping) else {"": None}
+    given: dict[str, Any] = {} if kernels is None else dict(kernels) if isinstance(kernels, Mapping) else {"": None}
     for name, one in given.items():
         if isinstance(one, type) and issubclass(one, Kernel):
             continue

@@ -221,7 +221,7 @@ def rebuild(
             raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
         return fitted
     summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
-    given = {name: header.get(name) for name in ("lever", "tool", "tool_tip")}
+    given: dict[str, Any] = {name: header.get(name) for name in ("lever", "tool", "tool_tip")}
     given |= {name: tensors.get(name) for name in ROBOT_TENSORS} | {"learnt": learnt}
     given["ball"] = header.get("ball", False) is True
     given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
@@ -379,6 +379,11 @@ def rebuild_registration(entry: Any, tensors: Tensors, n: int) -> Registration:
         as_tensor(arrays[name], PREFIX + name, shape)
     rigid(arrays["transform"], PREFIX + "transform")
     shift = None if entry["shift"] is None else as_tensor(entry["shift"], "shift", (m // 3, 3))
-    words = {"outliers": tuple(map(int, entry["outliers"])), "undetermined": tuple(map(str, entry["undetermined"]))}
-    named = {name: entry[name] for name in (*NUMBERS, "same", "free")} | {TABLE: str(entry.get(TABLE, ""))}
+    words: dict[str, Any] = {
+        "outliers": tuple(map(int, entry["outliers"])),
+        "undetermined": tuple(map(str, entry["undetermined"])),
+    }
+    named: dict[str, Any] = {name: entry[name] for name in (*NUMBERS, "same", "free")} | {
+        TABLE: str(entry.get(TABLE, ""))
+    }
     return Registration(**arrays, **words, **named, shift=shift)

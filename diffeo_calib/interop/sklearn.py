@@ -78,8 +78,9 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__, fix=fix)
+        data: Any = y
         if isinstance(y, RowGroups):
-            q, data = self._in_order(robot, validate_data(self, X, dtype=np.float64)), y
+            q = self._in_order(robot, validate_data(self, X, dtype=np.float64))
             if not np.array_equal(q, y.q.numpy()):
                 raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
         else:

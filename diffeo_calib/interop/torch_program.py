@@ -57,7 +57,7 @@ class Constants(nn.Module):
 
     def __init__(self, record: Any) -> None:
         super().__init__()
-        for name in record._fields if isinstance(record, tuple) else [field.name for field in fields(record)]:
+        for name in getattr(record, "_fields", None) or [field.name for field in fields(record)]:
             value = getattr(record, name)
             if isinstance(value, np.ndarray) and value.dtype == np.float64:
                 tensor = torch.tensor(np.ascontiguousarray(value), dtype=torch.float64, device=HOST)

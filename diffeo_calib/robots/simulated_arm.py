@@ -202,8 +202,8 @@ def _draw_waves(
     numbers = np.concatenate(
         [np.stack([harmonics, amplitudes]).reshape(2, -1), np.array(lines).reshape(-1, 3).T[1:]], 1
     )
-    found = (torch.from_numpy(part.copy()) for part in (*numbers, phases))
-    return torch.tensor(joints, dtype=torch.int64, device="cpu"), *found
+    frequencies, sizes, shifts = (torch.from_numpy(part.copy()) for part in (*numbers, phases))
+    return torch.tensor(joints, dtype=torch.int64, device="cpu"), frequencies, sizes, shifts
 
 
 def _loads(chain: Tree) -> tuple[Tensor, Tensor]:

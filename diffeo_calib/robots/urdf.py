@@ -54,8 +54,8 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
     path = Path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     urdf = URDF.parse(content, path)
-    tip, base = (_only_end(urdf, role) if given is None else given for role, given in (("tip", tip), ("base", base)))
-    paths = _Paths.between(urdf, base, tip, load)
+    end = _only_end(urdf, "tip") if tip is None else tip
+    paths = _Paths.between(urdf, _only_end(urdf, "base") if base is None else base, end, load)
     ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))

@@ -128,7 +128,9 @@ def _read_joint(joint: Any, path: Path) -> JointElement:
         if (element := joint.find(part)) is None:
             raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
         ends.append(_attribute(element, "link", f"<{part}> of {what}", path))
-    limits = [_numbers(joint, "limit", *end, where, finite=False) for end in (("lower", (-inf,)), ("upper", (inf,)))]
+    parent, child = ends
+    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where, finite=False)
+    (upper,) = _numbers(joint, "limit", "upper", (inf,), where, finite=False)
     (multiplier,) = _numbers(joint, "mimic", "multiplier", (1.0,), where)
     (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
     mimic = joint.find("mimic")
@@ -137,7 +139,7 @@ def _read_joint(joint: Any, path: Path) -> JointElement:
     axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
     xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
     origin = transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
-    return JointElement(name, kind, *ends, origin, axis, (limits[0][0], limits[1][0]), driver, multiplier, offset)
+    return JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
 
 def _numbers(
