@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan, pi
 from pathlib import Path
+from typing import Any
 
 from diffeo_calib.common.errors import RobotError, few, shown
 from diffeo_calib.common.files import read_regular
@@ -221,7 +222,7 @@ def _kind(row: Mapping[str, str]) -> str:
 def _row(row: Mapping[str, str], units: Mapping[str, str], what: str) -> DHRow:
     """The parameters of a joint."""
     kind = _kind(row)
-    value = {name: _number(row, name) for name in NUMBERS}
+    value: dict[str, Any] = {name: _number(row, name) for name in NUMBERS}
     wrong = [name for name in NUMBERS if not isfinite(value[name])] + ["kind"] * (not kind)
     wrong += ["unread"] * bool(row.get("unread"))  # of tables that `export` writes
     if wrong:
