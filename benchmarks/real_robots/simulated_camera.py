@@ -122,9 +122,14 @@ def seen_corners(boards: Tensor, noise_px: float, seed: int = 7, camera: Camera 
     return found.masked_fill(outside[..., None], torch.nan)
 
 
-def camera_arm(rows: int, seed: int = 1, print_seed: int | None = None, *, second: bool = False) -> CameraArm:
-    """An arm whose camera sees the board in random configurations; the print as of :func:`true_camera`."""
-    arm = SimulatedArm(seed=seed, markers=3)
+def camera_arm(
+    rows: int, seed: int = 1, print_seed: int | None = None, *, second: bool = False, worse: float = 1.0
+) -> CameraArm:
+    """An arm whose camera sees the board in random configurations; the print as of :func:`true_camera`.
+
+    ``worse``: factor on the arm's errors of joints and links.
+    """
+    arm = SimulatedArm(seed=seed, markers=3, transmission=worse, geometry=worse)
     given = torch.tensor(CAMERA_BESIDE if second else CAMERA, dtype=torch.float64, device=HOST)
     camera = transforms(rotation(given[None, 3:]), given[None, :3])
     base = torch.eye(4, dtype=torch.float64, device=HOST)

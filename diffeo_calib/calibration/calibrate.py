@@ -41,7 +41,7 @@ from diffeo_calib.calibration.scales.of_models import check_models
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings
+from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -57,6 +57,7 @@ from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import CHANGE, VALUE
 
 Controls = int | Literal["auto", "all"]
 Table = Measurements | Readings | Observations
@@ -175,6 +176,10 @@ def calibrate(
             again = choose(drifting.tangent_data(), measurements, *stages)
             if worth_it(chosen.left_out.errors, again.left_out.errors):
                 placed, chosen = drifting, again
+        if (widened := placed.widened(chosen.data, chosen.selection.scales)) is not None:
+            placed, found = widened
+            chosen = choose(placed.tangent_data(), measurements, *stages)
+            warn_user(found.sentence)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, note=note, warned=warned)
@@ -222,11 +227,11 @@ def _result(
     warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck_columns(placed.data))
     changed = placed.mislabelled(model, found)
     if changed is None:
-        devices = placed.placement.hypotheses(data, said=False)
-        changed = change_during(placed.data.line_numbers, data, scales, chosen.left_out, devices)
+        devices, lines = placed.placement.hypotheses(data, CHANGE), placed.data.line_numbers
+        changed = change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
-    found_lengths = lengths(data, scales, placed.placement.hypotheses(data, said=True))
+    found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     doubt = warn_of_lengths(found_lengths)
     rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
     return CalibrationResult(

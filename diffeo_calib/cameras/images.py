@@ -113,6 +113,11 @@ class Camera:
         """(14,) standard deviations of the unknowns."""
         return self.root.square().sum(1).sqrt()
 
+    @property
+    def longer(self) -> Tensor:
+        """(c,) errors of unit variance, of which ``root`` has the effects, that are a focal length longer by itself."""
+        return torch.linalg.pinv(self.root)[:, :2] @ self.unknowns[:2]
+
     def pixels(self, poses: Tensor, points: Tensor) -> Tensor:
         """Where corners (N, K, 3) of a board at poses (N, 4, 4) are seen: (N, K, 2)."""
         real = real_board(points, self.board, self.half_size)

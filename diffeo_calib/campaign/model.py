@@ -35,7 +35,7 @@ from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import Hypothesis
+from diffeo_calib.sensors.devices import CHANGE, Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -373,7 +373,7 @@ class CampaignModel:
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
         rows = data.rows(index)
-        return Around(rows, lambda: changes_of(rows, placed.placement.hypotheses(data, said=False), index))
+        return Around(rows, lambda: changes_of(rows, placed.placement.hypotheses(data, CHANGE), index))
 
     def _errors(self) -> tuple[Numbers, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.

@@ -107,7 +107,8 @@ class Places:
     )
     by: str | None = option(
         "Column of both files: texts that are the same in both, such as names of poses; or times, of which the nearest "
-        "within half a step belong together. Of two recordings the clocks may differ, and every stop becomes a row.",
+        "within half a step belong together. Of two recordings the clocks may differ, and every stop becomes a row. "
+        "COLUMN=OTHER where it has another name in the file of the places.",
         "COLUMN",
     )
 

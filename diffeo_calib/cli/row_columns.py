@@ -204,7 +204,7 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
     common = {name: len(own & texts[1][name]) for name, own in texts[0].items() if name in texts[1]}
     if given.by is None and not common:
         expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
-        fix = "add one, such as the number of the pose"
+        fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
         raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
     by = given.by or max(common, key=lambda name: common[name])
     found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)

@@ -160,6 +160,16 @@ class ImageTable(SocketTable):
             raise AssertionError("a table of images")
         return self._pose_slopes() @ self.pose_larger
 
+    def with_own_focal_lengths(self, deviation: float) -> Self:
+        """The rows as if the focal length of every image had an error of its own, a share, as of an autofocus."""
+        if self.pose_covariance is None or self.pose_shared is None or self.seen_by is None:
+            raise AssertionError("a table of images")
+        effects = torch.zeros_like(self.pose_shared[..., :1])
+        for number, camera in enumerate(self.cameras.values()):
+            own = self.seen_by == number
+            effects[own] = self.pose_shared[own] @ camera.longer[:, None]
+        return with_attributes(self, pose_covariance=self.pose_covariance + deviation**2 * effects @ effects.mT)
+
     def errors_along(self, R: Tensor) -> dict[str, object]:
         """Known errors along axes turned by R (N, 3, 3), as if those of the coordinates were independent."""
         found: dict[str, object] = {}

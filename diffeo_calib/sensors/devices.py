@@ -36,20 +36,25 @@ SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
 
 
+CHANGE, VALUE, ROW = "change", "value", "row"
+"""What a hypothesis opens: what changes at a row or drifts, one number that a device is said to hold, such as a focal
+length, or a number that differs from row to row."""
+
+
 class Hypothesis(NamedTuple):
     """Something that may be wrong, or change, of a device, the robot or its tool.
 
     Args:
         name: in words. effects: (N, r, U) derivatives of N rows by its unknowns, m. unit: of a single unknown, and its
             size in m, rad or relative; None to report the motion. fix: what to do about it.
-        said: whether it is one number that a device is said to hold, such as a focal length; else it may change.
+        about: :data:`CHANGE`, :data:`VALUE` or :data:`ROW`.
     """
 
     name: str
     effects: Tensor
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"
-    said: bool = False
+    about: str = CHANGE
 
 
 @dataclass(frozen=True, eq=False)

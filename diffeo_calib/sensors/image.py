@@ -13,6 +13,7 @@ from diffeo_calib.maps.observation import CameraPoints
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
     SMALLEST_M,
+    VALUE,
     Devices,
     Hypothesis,
     moved_pose,
@@ -93,13 +94,13 @@ class Cameras(Devices):
             "check the intrinsic parameters, and the size of the images",
         )
         for name, own in self._of_each(image[..., None], device):
-            yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, said=True)
+            yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, about=VALUE)
         for axis in range(2):
             shift = torch.zeros_like(image[..., None])
             shift[:, axis, 0] = self.metres[device]
             for name, own in self._of_each(shift, device):
                 words = f"the principal point of '{name}' along {'uv'[axis]} (in focal lengths)"
-                yield Hypothesis(words, own, ("%", 1e-2), fix, said=True)
+                yield Hypothesis(words, own, ("%", 1e-2), fix, about=VALUE)
 
     def where(self, number: int) -> str:
         pose = self.poses[number]

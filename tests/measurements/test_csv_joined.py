@@ -36,6 +36,13 @@ def test_lines_have_the_numbers_of_the_places(tmp_path: Path) -> None:
     )
 
 
+def test_the_column_may_have_two_names(tmp_path: Path) -> None:
+    places = ("x,y,z,name of the pose", *PLACES[1:])
+    header, lines = read_cells(joined(tmp_path, places=places, by="pose=name of the pose"), ",")
+    assert header == ["pose", "a", "b", "x", "y", "z"]
+    assert lines[0] == (2, ["p3", "5", "6", "9", "9", "9"])
+
+
 def test_messages_name_both_files(tmp_path: Path) -> None:
     found = joined(tmp_path, places=(*PLACES[:3], "?,8,8,p1"))
     with pytest.raises(

@@ -119,7 +119,7 @@ WRONG_FILES: dict[str, tuple[str | bytes, dict[str, Any], tuple[str, ...]]] = {
         ("2 line(s)", "5 repeats 2, 6 repeats 3", "duplicates='drop'"),
     ),
     "quote": (HEADER + '1,2,"3,4,5\n6,7,8,9,10\n', {}, ("line 2", "not valid CSV", "quotes")),
-    "not text": (b"PK\x03\x04\xff\xfe", {}, ("no text but a spreadsheet", "export the table as CSV")),
+    "not text": (b"PK\x03\x04\xff\xfe", {}, ("no text but a spreadsheet", "save it as .xlsx or CSV")),
 }
 
 

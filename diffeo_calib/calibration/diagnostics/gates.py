@@ -26,6 +26,10 @@ WORTH = 0.97
 SURE = 3.0
 """Standard deviations from which a fall of squared left-out errors is no chance."""
 
+ROW_ODDS = 6.0
+"""Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
+0.1 % fourteen and more."""
+
 # --- rows of a campaign, one by one ---
 
 WRONG_ROW_CHANCE, UNDONE_CHANCE = 1e-8, 1e-3

@@ -13,8 +13,9 @@ has one set of effects for all rows, and gains chi-squared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import exp, lgamma, log
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -41,6 +42,10 @@ SLOW = (
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
     "then drifts"
 )
+
+
+VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
+"""RMS motions by a number that differs from row to row."""
 
 
 class Finding(NamedTuple):
@@ -93,7 +98,7 @@ class Finding(NamedTuple):
         distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
         typical = distances[distances.amax(1) > 0].median(0).values
         distance = float(typical[typical > 0].median())
-        if name == MARKERS:
+        if name == MARKERS and data.basis is None:
             distance = float(typical.max())
             single = float(typical.min()) < gates.OTHER_MARKERS * distance
             name = f"marker {int(typical.argmax())}" if single else name
@@ -111,13 +116,15 @@ def change_during(
     scales: Hyperparameters,
     left_out: LeaveOneOut,
     devices: Iterable[Hypothesis] = (),
+    *,
+    bodies: Mapping[str, str] = MappingProxyType({}),
 ) -> str | None:
     """A sentence about the clearest change during the measurements, with the row, the size and what to do; or None.
 
     Args:
         numbers: (N,) numbers of the rows; their order is that of the measurements.
         data: the measurements. scales: those of the model. left_out: leave-one-out errors with these.
-        devices: what may change of devices in unknown places.
+        devices: what may change of devices in unknown places. bodies: better names of :data:`BASE` and :data:`MARKERS`.
     """
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     if len(rows) < 4 * gates.CHANGE_ROWS:
@@ -127,7 +134,8 @@ def change_during(
     order = numbers.argsort()
     usual = data.noise_model.of_freedom(chi2_median, left_out.squares)
     excess = max(1.0, float((left_out.squares / usual).nanmedian()))  # of errors that the scales understate
-    found = findings(changes_of(some, devices, rows), process, order, excess=excess)
+    changes = [one._replace(name=bodies.get(one.name, one.name)) for one in changes_of(some, devices, rows)]
+    found = findings(changes, process, order, excess=excess)
     likely = [one for one in found if one.displacement > least]
     if not likely or len(found) * min(one.chance for one in likely) > gates.CHANGE_CHANCE:
         return None
@@ -149,6 +157,44 @@ def change_during(
         got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
         fix=SLOW if best.row is None else f"check what happened then; {best.hypothesis.fix}",
     )
+
+
+class Variation(NamedTuple):
+    """A number that differs from row to row.
+
+    Args:
+        hypothesis: which. size: its standard deviation. motion: RMS motion of a coordinate by it, m. odds: logarithm.
+    """
+
+    hypothesis: Hypothesis
+    size: float
+    motion: float
+    odds: float
+
+    @property
+    def sentence(self) -> str:
+        """What differs by how much, and what to do."""
+        unit, per_unit = self.hypothesis.unit or ("mm", 1e-3)
+        got = f"about {self.size / per_unit:.2g} {unit}, which moves the tool by {1e3 * 3**0.5 * self.motion:.2g} mm"
+        what = f"{self.hypothesis.name} seems to differ"
+        return sentence(what, expected="the same for all rows", got=got, fix=self.hypothesis.fix)
+
+
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
+    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i."""
+    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
+    process, found = some.process(scales), list[Variation]()
+    numbers = torch.arange(len(process.numbers.cells), device=rows.device)
+    for one in hypotheses:
+        e = process.numbers.of_table(some.motions_in_numbers(one.effects[rows]))[:, 0]
+        E = e.new_zeros(len(e), len(rows)).index_put((numbers, process.numbers.owner), e)
+        motion = float(e[e != 0].square().mean().sqrt())
+        sizes = VARIATION_M.to(e) / motion
+        odds = Evidence.of(E[:, (E != 0).any(0)], process).log_odds(sizes.square())
+        best = int(odds.argmax())
+        found.append(Variation(one, float(sizes[best]), float(VARIATION_M[best]), float(odds[best])))
+    clear = max(found, key=lambda one: one.odds, default=None)
+    return None if clear is None or clear.odds < gates.ROW_ODDS else clear
 
 
 def findings(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.moved_devices import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
@@ -21,7 +22,7 @@ from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
-from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, median_weights
+from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View
 
@@ -29,6 +30,10 @@ T = TypeVar("T")
 
 SIZE_WARNED = 0.006
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
+FOCUS = "lock focus and zoom of the camera; until then this counts as noise of the images"
+ON_TOOL = {MARKERS: "the camera on the tool", BASE: "the board, or the robot's base"}
+FIXED = {MARKERS: "the board on the tool", BASE: "the camera, or the robot's base"}
+"""What is on the tool and what stands."""
 ROUNDS = 5
 PARTS = slice(0, len(LENS)), slice(len(LENS), None)
 """Lens and board among the unknowns of a camera."""
@@ -103,11 +108,11 @@ class LensAndBoard(CameraErrors):
         found: list[Any] = []
         for shared in data.shared_errors():
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
-            deviations, explained = shared.noise.diagonal(dim1=1, dim2=2).sqrt(), []
+            explained = list[Explained]()
             for number in range(len(shared.cameras)):
                 own = shared.seen_by == number
                 nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
-                explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _rms_distance(deviations[own])))
+                explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number)))
             places = _places(data, rows, registration, sessions)
             apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
@@ -139,6 +144,25 @@ class LensAndBoard(CameraErrors):
             explained.append(replace(self.explained[number], **known))
             cameras[name] = replace(camera, unknowns=camera.unknowns + change, root=root)
         return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
+
+    def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
+        effects = data.points.new_zeros(*data.points.shape, 1)
+        for number, camera in enumerate(self.shared.cameras.values()):
+            own = self.shared.seen_by == number
+            effects[self.rows[own], : self.shared.slopes.shape[1]] = self.shared.slopes[own] @ camera.longer[:, None]
+        effects = effects if data.slopes is None else data.slopes @ effects
+        yield Hypothesis("the focal length of the images", effects, ("%", 1e-2), FOCUS, about=ROW)
+
+    @property
+    def bodies(self) -> Mapping[str, str]:
+        return ON_TOOL if self.on_tool else FIXED
+
+    def widened(self, table: Measurements) -> LensAndBoard:
+        """The same with the noise of the images as a table of them has it now."""
+        (shared,), each = table.shared_errors(), range(len(self.explained))
+        corners = [_corners(shared, number) for number in each]
+        explained = tuple(replace(self.explained[number], corners=corners[number]) for number in each)
+        return replace(self, shared=shared, explained=explained)
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         seen = self._boards(row, points, views)
@@ -197,6 +221,11 @@ class LensAndBoard(CameraErrors):
             for name, own in zip(self.shared.cameras, self._cameras, strict=True)
         }
         return {"cameras": found} if len(found) > 1 else {"camera": next(iter(found.values()))}
+
+
+def _corners(shared: SharedErrors, number: int) -> float:
+    """RMS distance at the tool by the noise of one image of a camera, m."""
+    return _rms_distance(shared.noise[shared.seen_by == number].diagonal(dim1=1, dim2=2).sqrt())
 
 
 def _at_tool(effects: Tensor, errors: Tensor, part: slice) -> float:

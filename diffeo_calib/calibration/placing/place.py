@@ -18,6 +18,7 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
+from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
@@ -41,13 +42,14 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import ROW, Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
@@ -253,6 +255,15 @@ class Placed:
         """The same with what may drift with columns of the table; None without such columns."""
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
         return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
+
+    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, Variation] | None:
+        """The same with what differs from row to row as noise of these; None if nothing clearly does."""
+        found = variation(data, scales, self.placement.hypotheses(data, ROW))
+        if found is None or self.coordinates is None:
+            return None
+        table = self.coordinates.table.with_own_focal_lengths(found.size)
+        sets = (one.widened(table) if isinstance(one, LensAndBoard) else one for one in self.placement)
+        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.

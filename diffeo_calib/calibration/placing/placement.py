@@ -137,6 +137,11 @@ class DeviceSet(ABC):
         """What of these devices may change during the measurements, or be wrong, with effects (N, R, U) on all rows."""
         return ()
 
+    @property
+    def bodies(self) -> Mapping[str, str]:
+        """Better names of what stands, and of what is on the tool, than those of diagnostics/moved_devices.py."""
+        return {}
+
     def groups(self) -> Iterable[tuple[str, Tensor]]:
         """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
         return ()
@@ -181,9 +186,14 @@ class Placement(tuple[DeviceSet, ...]):
         """The first set of a kind; None without one."""
         return next((own for own in self if isinstance(own, kind)), None)
 
-    def hypotheses(self, data: Seen, *, said: bool) -> list[Hypothesis]:
-        """What all devices are said to hold, or what of them may change."""
-        return [one for own in self for one in own.hypotheses(data) if one.said == said]
+    def hypotheses(self, data: Seen, about: str) -> list[Hypothesis]:
+        """Those about one of :class:`Hypothesis`: what all devices are said to hold, or what of them may change."""
+        return [one for own in self for one in own.hypotheses(data) if one.about == about]
+
+    @property
+    def bodies(self) -> Mapping[str, str]:
+        """See :attr:`DeviceSet.bodies`."""
+        return {name: words for own in self for name, words in own.bodies.items()}
 
     def sees(self, row: int, points: Tensor) -> Tensor:
         """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""

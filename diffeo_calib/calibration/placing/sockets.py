@@ -50,7 +50,7 @@ from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import Hypothesis
+from diffeo_calib.sensors.devices import VALUE, Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.places import SOCKET, PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
@@ -206,7 +206,7 @@ class SocketDevices(DeviceSet):
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
             yield Hypothesis(
-                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, said=True
+                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE
             )
 
     def effects(self, data: Seen) -> Tensor:

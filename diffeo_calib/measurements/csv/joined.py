@@ -83,14 +83,15 @@ def joined_file(
     """A file with the columns of both tables.
 
     Args:
-        joints, places: the files. by: the common column. sep, decimal: as of a table; another usual separator of one of
-            the files is found by the common column.
+        joints, places: the files. by: the common column, or "A=B" where the places have it under another name B.
+        sep, decimal: as of a table; another usual separator of one of the files is found by the common column.
         several: whether lines of places may share their joint values, as those of markers do.
 
     Raises:
         MeasurementError: a file that cannot be read or lacks the column, several partners of a line, or no pair.
     """
-    tables = table, measured = _Table.read(joints, by, sep), _Table.read(places, by, sep)
+    own, _, other = by.partition("=")
+    tables = table, measured = _Table.read(joints, own, sep), _Table.read(places, other or own, sep)
     times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
     timed = all(len(own) > 1 and np.isfinite(own).all() for own in times)
     if timed and all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times):

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.cells import number, repeated
+from diffeo_calib.measurements.csv.sheets import as_text
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -37,8 +38,6 @@ COMMENTS = "#", "%", "//"
 """Marks that begin a comment."""
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
-BINARY = {b"PK\3\4": "a spreadsheet", b"\xd0\xcf\x11\xe0": "a spreadsheet", b"\x93NUMPY": "an array of numpy"}
-"""First bytes of files that are no text, and what they are."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
 ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
 """Units as they are written, and their names."""
@@ -79,6 +78,8 @@ class CsvLines:
                 copy = stack.enter_context(tempfile.TemporaryFile())
                 shutil.copyfileobj(file, copy)
                 file = copy
+            sheet = as_text(self.path, file, self.sep)
+            file = file if sheet is None else sheet.text
             encoding = self._encoding(file)
             file.seek(0)
             self._file = stack.enter_context(TextIOWrapper(file, encoding, "replace", newline=""))
@@ -90,6 +91,7 @@ class CsvLines:
                 what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
                 raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
             self._notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig")
+            self._notes += [] if sheet is None else sheet.notes
             self._find_header(lines)
             self._stack = stack.pop_all()
         return self
@@ -129,17 +131,16 @@ class CsvLines:
         part, decoder = file.read(AT_ONCE), codecs.getincrementaldecoder("utf-8")()
         if part.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             return "utf-16"
-        kind, encoding = next((name for first, name in BINARY.items() if part.startswith(first)), None), "utf-8-sig"
-        while kind is None and part:
-            kind = "binary" if b"\0" in part else None
+        encoding = "utf-8-sig"
+        while part:
+            if b"\0" in part:
+                what, fix = f"file '{self.path}' is no text but binary", "export the table as CSV"
+                raise MeasurementError.of(what, expected="a CSV file", fix=fix)
             try:
                 decoder.decode(part, final=len(part) < AT_ONCE)
             except UnicodeDecodeError:
                 encoding = "cp1252"
             part = file.read(AT_ONCE)
-        if kind is not None:
-            what, fix = f"file '{self.path}' is no text but {kind}", "export the table as CSV"
-            raise MeasurementError.of(what, expected="a CSV file", fix=fix)
         return encoding
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:

@@ -1,0 +1,182 @@
+"""Tables that are no text, as lines of text: spreadsheets (.xlsx), arrays of NumPy (.npy, .npz), variables (.mat).
+
+An array (N, k) has a column for each k, named after it and numbered from 1; (N, 3) of an array in a file of several is
+x, y, z where the name is that of places; of poses (N, 4, 4) the columns are numbered by row and column, 00 to 33. Of
+several arrays those with the most common number of rows are the table.
+"""
+
+from __future__ import annotations
+
+import csv
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import BytesIO, StringIO
+from itertools import product
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from diffeo_calib.common.errors import MeasurementError, few
+
+ZIP, OLD_SHEET, NUMPY, MATLAB = b"PK\3\4", b"\xd0\xcf\x11\xe0", b"\x93NUMPY", b"MATLAB "
+"""First bytes of files that are no text."""
+HDF5 = b"MATLAB 7.3"
+PLACES = {"p", "pos", "position", "positions", "point", "points", "xyz", "marker", "markers", "measured", "tcp"}
+"""Names of arrays (N, 3) of places."""
+
+
+class Sheet(NamedTuple):
+    """The text of a table in UTF-8, and what was decided, in words."""
+
+    text: BinaryIO
+    notes: list[str]
+
+
+def as_text(path: Path, file: BinaryIO, sep: str) -> Sheet | None:
+    """A table that is no text, with ``sep`` between its cells; None for text.
+
+    Raises:
+        MeasurementError: a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
+    """
+    file.seek(0)
+    first = file.read(len(HDF5))
+    file.seek(0)
+    if first.startswith(OLD_SHEET):
+        raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
+    if first.startswith(HDF5):
+        raise _no_table(path, "a MATLAB file of version 7.3", "save it with `save(..., '-v7')`, or as CSV")
+    if first.startswith(ZIP):
+        names = _zipped(file)
+        reader = _arrays_of_zip if names and all(name.endswith(".npy") for name in names) else _spreadsheet
+    elif first.startswith(NUMPY):
+        reader = _array
+    elif first.startswith(MATLAB) or (b"\0" in first and path.suffix.lower() == ".mat"):  # version 4 has no mark
+        reader = _variables
+    else:
+        return None
+    rows, notes = reader(path, file)
+    text = StringIO()
+    csv.writer(text, delimiter=sep, lineterminator="\n").writerows(rows)
+    return Sheet(BytesIO(text.getvalue().encode()), notes)
+
+
+Rows = Sequence[Sequence[object]]
+
+
+def _no_table(path: Path, got: str, fix: str) -> MeasurementError:
+    return MeasurementError.of(f"file '{path}' is no text but {got}", expected="a table", fix=fix)
+
+
+def _zipped(file: BinaryIO) -> list[str]:
+    """Names of the files in an archive; none if it is damaged."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return archive.namelist()
+    except zipfile.BadZipFile:
+        return []
+    finally:
+        file.seek(0)
+
+
+def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """The sheet with the most filled cells: values, not formulas."""
+    try:
+        from openpyxl import load_workbook  # noqa: PLC0415  # optional
+    except ImportError:
+        fix = "pip install 'diffeo_calib[excel]', or export the table as CSV"
+        raise _no_table(path, "a spreadsheet, and openpyxl, which reads it, is not installed", fix) from None
+    try:
+        book = load_workbook(file, read_only=True, data_only=True)
+        sheets = {sheet.title: list(sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
+    except Exception as error:  # openpyxl raises errors of many kinds for damaged files
+        raise _no_table(path, f"a spreadsheet that cannot be read ({error})", "save it as .xlsx or CSV") from error
+    filled = {name: sum(cell is not None for row in rows for cell in row) for name, rows in sheets.items()}
+    if not any(filled.values()):
+        raise _no_table(path, "a spreadsheet without cells", "check that it was saved completely")
+    best = max(filled, key=filled.__getitem__)
+    others, rows = [name for name in sheets if name != best and filled[name]], sheets[best]
+    used = [k for k in range(max(map(len, rows))) if any(len(row) > k and row[k] is not None for row in rows)]
+    cells = [[_cell(row[k]) if len(row) > k else "" for k in used] for row in rows]
+    return cells, [f"sheet '{best}' read, not {few(others)}"] * bool(others)
+
+
+def _cell(value: Any) -> str:
+    """A number with all of its digits, or a text in one line."""
+    if value is None:
+        return ""
+    return repr(value) if isinstance(value, int | float) else " ".join(str(value).split())
+
+
+def _array(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """An array (N, k), or one with names."""
+    found = _loaded(path, lambda: np.load(file, allow_pickle=False))
+    if found.dtype.names:
+        return _joined(path, {name: found[name] for name in found.dtype.names})
+    if found.ndim != 2 or found.dtype.kind not in "fiu":
+        raise _no_table(path, f"an array of shape {found.shape}", "save numbers of shape (N, columns), or with names")
+    return _texts(found), []
+
+
+def _arrays_of_zip(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    return _joined(path, _loaded(path, lambda: dict(np.load(file, allow_pickle=False))))
+
+
+def _variables(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """Variables of MATLAB, and fields of those that are structures."""
+    from scipy.io import loadmat  # noqa: PLC0415  # slow to import
+
+    whole = _loaded(path, lambda: loadmat(file, squeeze_me=True, struct_as_record=True))
+    found = dict[str, Any]()
+    for name, value in whole.items():
+        fields = getattr(getattr(value, "dtype", None), "names", None)
+        if fields and value.ndim == 0:
+            found |= {f"{name}_{field}": value[field].item() for field in fields}
+        elif not name.startswith("__"):
+            found[name] = value
+    return _joined(path, found)
+
+
+def _loaded(path: Path, load: Callable[[], Any]) -> Any:
+    try:
+        return load()
+    except Exception as error:  # of damaged files, and of arrays of objects
+        raise _no_table(path, f"arrays that cannot be read ({error})", "save numbers alone, or export CSV") from error
+
+
+def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
+    """Arrays (N, ...) of numbers or texts side by side below their names; those of other lengths are left out."""
+    known = {name: np.asarray(array) for name, array in arrays.items()}
+    usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
+    counts = Counter[int]()
+    for array in usable.values():
+        counts[len(array)] += array[:1].size
+    if not counts:
+        raise _no_table(path, f"the arrays {few(list(known))}", "save numbers of shape (N,) or (N, columns)")
+    rows = counts.most_common(1)[0][0]
+    own = {name: array for name, array in usable.items() if len(array) == rows}
+    header = [column for name, array in own.items() for column in _names(name, array.shape[1:])]
+    values = zip(*(_texts(array.reshape(rows, -1)) for array in own.values()), strict=True)
+    left = [name for name in known if name not in own]
+    notes = [f"arrays {few(left)} left out: they have no {rows} rows"] * bool(left)
+    return [header, *([cell for part in row for cell in part] for row in values)], notes
+
+
+def _names(name: str, shape: tuple[int, ...]) -> Iterator[str]:
+    """Columns of an array."""
+    if not shape:
+        yield name
+    elif shape == (3,) and name.lower().rpartition("_")[2] in PLACES:
+        yield from (f"{name}_{axis}" for axis in "xyz")
+    elif len(shape) == 1:
+        yield from (f"{name}_{k + 1}" for k in range(shape[0]))
+    else:
+        yield from (f"{name}_{row}{column}" for row, column in product(range(shape[0]), range(shape[1])))
+
+
+def _texts(array: np.ndarray) -> list[list[str]]:
+    """The cells of an array (N, k)."""
+    array = array.astype(np.int64) if array.dtype.kind == "b" else array
+    array = array.astype(np.str_) if array.dtype.kind == "S" else array
+    return [[_cell(value) for value in row] for row in array.tolist()]

@@ -1,0 +1,56 @@
+"""What changes between images is told from errors of the arm: the focus of the camera, and its mount."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import torch
+from simulated_camera import BOARD_PRIOR, HEIGHT, LENS, WIDTH, CameraArm, camera_arm
+
+import diffeo_calib as dc
+from diffeo_calib.common.device import seeded
+from diffeo_calib.robots.se3 import twist_transform
+
+IMAGES, NOISE_PX = 40, 0.1
+ARM = camera_arm(IMAGES, 2)
+
+
+def calibrated(arm: CameraArm, focus: float = 0.0) -> tuple[dc.CalibrationResult, list[str]]:
+    """With a focal length of each image that differs by this share, and the warnings."""
+    q, corners = arm.shown(NOISE_PX, 2)
+    own = 1.0 + focus * torch.randn(len(q), 1, 1, dtype=q.dtype, generator=seeded(1))
+    middle = torch.tensor(LENS[2:4], dtype=q.dtype)
+    pixels = middle + own * (corners[..., 3:] - middle)
+    outside = (pixels < 0).any(2) | (pixels > torch.tensor([WIDTH - 1, HEIGHT - 1])).any(2)
+    corners = torch.cat([corners[..., :3], pixels], 2).masked_fill(outside[..., None], torch.nan)
+    data = dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), arm.arm.nominal.joint_names, board=BOARD_PRIOR)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        result = dc.calibrate(arm.arm.nominal, data)
+    return result, [str(one.message) for one in found]
+
+
+def error(result: dc.CalibrationResult) -> float:
+    return ARM.error(result.model, ARM.arm.sample(200, seed=9))
+
+
+def test_a_camera_that_focuses_is_no_error_of_the_arm() -> None:
+    (clean, silent), (focusing, said) = calibrated(ARM), calibrated(ARM, 0.004)
+    assert not silent
+    assert len(said) == 1
+    assert "the focal length of the images seems to differ" in said[0]
+    assert "lock focus" in said[0]
+    # with this noise in all directions the error was twice as large
+    assert error(focusing) < 1.3 * error(clean)
+    arm = [next(iter(one.placement.entry().values()))["explained_m"] for one in (clean, focusing)]  # type: ignore[index]
+    assert arm[1]["corners"] > 2.0 * arm[0]["corners"]
+
+
+def test_a_camera_that_slips_on_its_mount_is_named() -> None:
+    slipped = ARM.boards.clone()
+    twist = 5e-4 * torch.tensor([[1.0, 0.0, 0.0, 3.0, 0.0, 0.0]], dtype=torch.float64)
+    slipped[IMAGES // 2 :] = twist_transform(twist) @ slipped[IMAGES // 2 :]
+    _, said = calibrated(replace(ARM, boards=slipped))
+    assert len(said) == 1
+    assert "the camera on the tool seems to have moved by about" in said[0]

@@ -1,0 +1,126 @@
+"""Spreadsheets, arrays of NumPy and variables of MATLAB hold the same rows as a CSV file."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+import torch
+from scipy.io import savemat
+
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.csv.files import read_measurements
+from diffeo_calib.measurements.csv.lines import CsvLines
+
+ROWS = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 5))
+JOINTS, PLACES = ROWS[:, :2], ROWS[:, 2:]
+UNITS = {"length": "m", "angle": "rad"}
+
+
+def _book(path: Path) -> None:
+    book = openpyxl.Workbook()
+    sheet = book.worksheets[0]
+    for row in ([], [None, "measured on Monday"], [None, "q_1", "q_2", "p_x", "p_y", "p_z"], *ROWS.tolist()):
+        sheet.append([None, *row] if len(row) == 5 else row)
+    book.save(path)
+
+
+def _two_sheets(path: Path) -> None:
+    _book(path)
+    book = openpyxl.load_workbook(path)
+    book.create_sheet("notes", 0).append(["see the other one"])
+    book.save(path)
+
+
+def _named(path: Path) -> None:
+    names = ["q_1", "q_2", "p_x", "p_y", "p_z"]
+    np.save(path, np.array([tuple(row) for row in ROWS], dtype=[(name, float) for name in names]))
+
+
+def _struct(path: Path) -> None:
+    savemat(path, {"log": {"q": JOINTS, "p": PLACES}})
+
+
+WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
+    "a spreadsheet": ("t.xlsx", _book, "q_1,q_2", "p_x,p_y,p_z"),
+    "the sheet with rows": ("t.xlsx", _two_sheets, "q_1,q_2", "p_x,p_y,p_z"),
+    "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
+    "an array with names": ("t.npy", _named, "q_1,q_2", "p_x,p_y,p_z"),
+    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.eye(3)), "q_1,q_2", "p_x,p_y,p_z"),
+    "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), "q_1,q_2", "p_x,p_y,p_z"),
+    "variables of old": (
+        "t.mat",
+        lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"),
+        "q_1,q_2",
+        "p_x,p_y,p_z",
+    ),
+    "a structure": ("t.mat", _struct, "log_q_1,log_q_2", "log_p_x,log_p_y,log_p_z"),
+}
+
+
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
+@pytest.mark.parametrize("sep", [",", ";"])
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str, sep: str) -> None:
+    name, write, joints, places = WRITERS[kind]
+    write(tmp_path / name)
+    data = read_measurements(tmp_path / name, joints.split(","), places.split(","), sep=sep, **UNITS)
+    torch.testing.assert_close(data.q, torch.from_numpy(JOINTS), rtol=1e-15, atol=0.0)  # spreadsheets have 16 digits
+    torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES), rtol=1e-15, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "note"),
+    [("the sheet with rows", "sheet 'Sheet' read, not notes"), ("arrays", "arrays gain left out: they have no 7 rows")],
+)
+def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
+    name, write, joints, places = WRITERS[kind]
+    write(tmp_path / name)
+    with pytest.warns(DiffeoCalibWarning, match=note):
+        read_measurements(tmp_path / name, joints.split(","), places.split(","), **UNITS)
+
+
+def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
+    _book(tmp_path / "t.xlsx")
+    with CsvLines(tmp_path / "t.xlsx", ",") as file:
+        (rows,) = file.blocks()
+    assert [line for line, _ in rows] == list(range(4, 11))
+
+
+def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
+    with CsvLines(tmp_path / "t.npz", ",") as file:
+        ((_, first), *_) = next(file.blocks())
+    assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
+    assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
+
+
+BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "one array of one axis": ("t.npy", lambda path: np.save(path, ROWS[0]), "of shape .5,."),
+    "objects": ("t.npy", lambda path: np.save(path, np.array([{}, []], dtype=object)), "cannot be read"),
+    "no rows": ("t.npz", lambda path: np.savez(path, gain=1.0), "the arrays gain"),
+    "damaged archive": ("t.xlsx", lambda path: path.write_bytes(b"PK\x03\x04 and no more"), "cannot be read"),
+    "no cells": ("t.xlsx", lambda path: openpyxl.Workbook().save(path), "without cells"),
+    "old spreadsheet": ("t.xls", lambda path: path.write_bytes(b"\xd0\xcf\x11\xe0" + bytes(60)), "save it as .xlsx"),
+    "MATLAB 7.3": ("t.mat", lambda path: path.write_bytes(b"MATLAB 7.3 MAT-file" + bytes(600)), "-v7"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_other_files_are_one_clear_error(tmp_path: Path, kind: str) -> None:
+    name, write, message = BAD[kind]
+    write(tmp_path / name)
+    with pytest.raises(MeasurementError, match=message) as caught:
+        read_measurements(tmp_path / name, ["1", "2"], ["3", "4", "5"], **UNITS)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_reader_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _book(tmp_path / "t.xlsx")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(MeasurementError, match=r"pip install 'diffeo_calib\[excel\]'"):
+        read_measurements(tmp_path / "t.xlsx", ["q_1", "q_2"], ["p_x", "p_y", "p_z"], **UNITS)
