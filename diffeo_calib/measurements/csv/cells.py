@@ -15,8 +15,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from torch import Tensor
-
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -36,14 +34,6 @@ class Hideable(NamedTuple):
     values: Sequence[int]
     deviations: Sequence[int]
     word: str
-
-
-class Block(NamedTuple):
-    """Lines of a file: numbers (B, c), NaN where hidden, texts by the name of their column, and the lines' numbers."""
-
-    numbers: Tensor
-    texts: dict[str, list[str]]
-    lines: list[int]
 
 
 LARGEST_NUMBER = 1e12

@@ -213,7 +213,7 @@ class Columns:
         Returns:
             q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), those beside them (N,), others (N, c).
         """
-        found, count = self._parts(raw), len(self.triples)
+        found, count = self.parts(raw), len(self.triples)
         values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
         q, table = self.joints.values(found["q"]), self.table
         turns = q.deg2rad() if table.angle == "deg" else q
@@ -239,7 +239,7 @@ class Columns:
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
-        found, table = self._parts(raw), self.table
+        found, table = self.parts(raw), self.table
         plain = self.joints.plain
         q = self.joints.values(found["q"])[:, plain] if bool(plain.any()) else found["q"][:, :0]
         slide = self.prismatic[plain]
@@ -252,7 +252,7 @@ class Columns:
             sentences += unlikely_units("rotations", _largest(found["rotations"]), self.rotation_unit, "rotation_angle")
         return sentences
 
-    def _parts(self, raw: Tensor) -> Values:
+    def parts(self, raw: Tensor) -> Values:
         """The columns of each group of rows (N, c)."""
         groups = self.groups
         return dict(zip(groups, raw.split([len(group.names) for group in groups.values()], dim=1), strict=True))

@@ -31,7 +31,7 @@ from diffeo_calib.measurements.csv.sensors import (
     sensors_of,
     text_columns,
 )
-from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
+from diffeo_calib.measurements.csv.tables import TableOrigin, read_table
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.readings import Readings
@@ -64,8 +64,8 @@ def read_observations(
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
     sensors, numbers = sensors_of(table), numeric_columns(table)
-    with TableFile(file, numbers, text_columns(table)) as whole:
-        rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
+    whole = read_table(file, numbers, text_columns(table), zeros=not growing)
+    rows = FileRows(file, numbers, *whole, alone=len(sensors) == 1)
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
@@ -241,8 +241,7 @@ def read_configurations(
     kinds: Sequence[str] | None = None,
 ) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    with TableFile(Path(path), Columns.of(table.joints_only(joints, kinds))) as file:
-        return file.read()[0]
+    return read_table(Path(path), Columns.of(table.joints_only(joints, kinds)))[0]
 
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
