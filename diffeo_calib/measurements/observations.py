@@ -81,15 +81,11 @@ class Observations(RowGroups):
 
     @property
     def device_names(self) -> list[str]:
-        """(N,) name of the device of each row, or of its set-up; "" without one.
-
-        Devices of other kinds are other devices, whatever their names.
-        """
+        """(N,) name of the device of each row, or of its set-up; "" without one. Kinds have devices of their own."""
         return self._texts([part.device_names for part in self.parts])
 
     @property
     def _devices(self) -> list[str]:
-        """See :class:`RowGroups`."""
         return self._texts([[name and f"{part.kind} {name}" for name in part.device_names] for part in self.parts])
 
     @property

@@ -23,7 +23,6 @@ from diffeo_calib.measurements.checks import (
     deviations,
     joint_table,
     session_numbers,
-    texts_of,
     tip_names,
 )
 from diffeo_calib.measurements.observations import joined_tables
@@ -64,7 +63,6 @@ class Readings(RowTable):
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
-
     NUMBERED = "device", "names"
     flattery = FLATTERY
 
@@ -123,7 +121,7 @@ class Readings(RowTable):
         if not offset_std and float(found.values[low]) <= 0.0:
             got, fix = f"{float(found.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
             raise MeasurementError.of("`lengths`", expected="above 0", got=got, fix=fix)
-        return _doubted(replace(found, offset_std=float(offset_std)), doubt)
+        return replace(found, offset_std=float(offset_std)).doubted(doubt)
 
     @classmethod
     def heights(
@@ -188,7 +186,8 @@ class Readings(RowTable):
         known = None if seen.std is None else seen.std / f.to(seen.std)
         tangents = (seen.values - c.to(seen.values)) / f.to(seen.values)
         unit = "px", (fx + fy) / 2.0
-        return _doubted(replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit), doubt)
+        changed = replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit)
+        return changed.doubted(doubt)
 
     @classmethod
     def of(
@@ -232,7 +231,7 @@ class Readings(RowTable):
             raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
         known = deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
-        return _doubted(found, doubt)
+        return found.doubted(doubt)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Any:
@@ -274,11 +273,6 @@ class Readings(RowTable):
     def column_kind(self) -> object:
         """Key that is equal for tables that can be joined into one."""
         return self.kind, self.offset_std, self.intrinsics, self.unit, self.std is None
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the device of each row."""
-        return texts_of(self.device, self.names, len(self))
 
     @property
     def ball_tip(self) -> str | None:
@@ -325,12 +319,6 @@ class Readings(RowTable):
     def compared(self) -> Tensor:
         """See :class:`RowTable`."""
         return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
-
-
-def _doubted(data: Readings, doubt: bool) -> Readings:
-    if doubt:
-        data.warn_if_suspicious()
-    return data
 
 
 MARKER, CONTACT = "marker", "contact"

@@ -21,6 +21,7 @@ from diffeo_calib.measurements.checks import (
     covariates,
     numbers_of,
     payloads,
+    texts_of,
     unlikely_si_joints,
 )
 from diffeo_calib.measurements.splits import (
@@ -84,6 +85,9 @@ class RowGroups:
     covariate_names: tuple[str, ...] = ()
     parts: tuple[Any, ...]
     index: tuple[Tensor, ...]
+    device_names: Sequence[str]
+    without_device: bool = True
+    """Whether neither a position nor a pose was measured."""
 
     @property
     def n(self) -> int:
@@ -105,7 +109,7 @@ class RowGroups:
         return (self.rows(i) for i in range(len(self)))
 
     def rows(self, index: object) -> Self:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
 
         Raises:
             IndexError: an index out of range, or a mask of the wrong length.
@@ -127,7 +131,7 @@ class RowGroups:
         return self.of_each(changed)
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the same rows with their values on a device."""
+        """The same rows with their values on a device."""
         place = usable(device)
 
         def moved(part: Any, _: Tensor) -> Any:
@@ -136,15 +140,11 @@ class RowGroups:
         return self.of_each(moved)
 
     def with_joint_names(self, names: Sequence[str]) -> Self:
-        """Return the same rows under other names of the joints.
-
-        Raises:
-            MeasurementError: a number of names that does not match, or repeated names.
-        """
+        """The same rows with n distinct names of the joints, else MeasurementError."""
         return self.with_columns(joint_names=checked_names(names, "names", self.n, "column of `q`"))
 
     def with_payload(self, payload: object, at: str | None = None) -> Self:
-        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+        """The same rows with a payload of known mass, whose sag a calibration then finds.
 
         Args:
             payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
@@ -156,13 +156,10 @@ class RowGroups:
         return self.with_columns(payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
     def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
-        """Return the same rows with columns with which device or arm may drift.
+        """The same rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
 
         A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
         the model, which then holds for the middle of each column's range.
-
-        Args:
-            time, temperature: values (N,), in any unit; None if they are not known.
 
         Raises:
             MeasurementError: not one per row, or not finite.
@@ -170,38 +167,27 @@ class RowGroups:
         return self.with_columns(**covariates({"time": time, "temperature": temperature}, self.q))
 
     def with_load(self, load: Payload) -> Self:
-        """Return the same rows with the masses of a payload, if there is one."""
+        """The same rows with the masses of a payload, if there is one."""
         return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
-        """Return the same rows with other line numbers (N,), which tell where every row comes from.
-
-        Raises:
-            MeasurementError: not one per row.
-        """
+        """The same rows with line numbers (N,), which tell where every row comes from, else MeasurementError."""
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
         return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
 
-    def with_file_sha256(self, sha256: str | None) -> Self:
-        """Return the same rows as those of the file with this SHA-256."""
-        return self.with_columns(file_sha256=sha256)
-
-    def with_origin(self, origin: object) -> Self:
-        """Return the same rows as those of a table that can be read again."""
-        return self.with_columns(origin=origin)
-
     def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly.
-
-        Real repeats differ by noise.
-        """
+        """(earlier row, row) for every row that repeats an earlier one of its kind exactly; real repeats differ."""
         pairs = zip(self.parts, self.index, strict=True)
         found = [sorted(rows[list(pair)].tolist()) for part, rows in pairs for pair in exact_copies(part.compared)]
         return sorted(((first, second) for first, second in found), key=lambda pair: pair[1])
 
     def _repr_html_(self) -> str:
-        ranges = [one for part in self.parts for one in part.ranges]
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
+        ranges = []
+        for joint, values in enumerate(self.q.T):
+            turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
+            name = printable(self.joint_names[joint]) if self.joint_names else f"joint {joint}"
+            ranges.append(value_range(name, values, turns))
+        return table_html(repr(self), RANGES, ranges + [one for part in self.parts for one in part.ranges])
 
     @property
     def masses(self) -> Tensor:
@@ -214,19 +200,14 @@ class RowGroups:
         return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
 
     @property
-    def places(self) -> Tensor:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
-        return self.socket_numbers
-
-    @property
     def socket_numbers(self) -> Tensor:
         """(N,) int64, number of each row's socket, -1 for other rows."""
         return torch.full((len(self.q),), NO_SOCKET, dtype=torch.int64, device=HOST)
 
     @property
-    def without_device(self) -> bool:
-        """Whether no position was measured."""
-        return True
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self.socket_numbers
 
     @property
     def smallest_inflation(self) -> float:
@@ -234,17 +215,11 @@ class RowGroups:
         return 1.0 if self.without_device else 0.0
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
-        """Label repeated configurations: rows with the same label are repeats of one another.
+        """Labels (N,) int64 0, 1, ... of repeated configurations, in the order of first appearance.
 
         The first row without a group leads a new one, which takes all later rows without a group that are within
-        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
-        Angles are compared without wrapping.
-
-        Args:
-            tolerance: largest difference from the leader in any joint, rad or m.
-
-        Returns:
-            (N,) int64 labels 0, 1, ... in the order of first appearance.
+        ``tolerance`` [rad or m] of the leader in every joint: rows along a slow trajectory do not chain into a single
+        group. Angles are compared without wrapping.
         """
         return repeat_groups(self.q, tolerance)
 
@@ -254,10 +229,6 @@ class RowGroups:
         Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
         repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
         rows. A device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
-
-        Args:
-            fraction: wanted share of rows in ``train``, between 0 and 1.
-            seed: of the shuffle.
 
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
@@ -273,13 +244,9 @@ class RowGroups:
         return self.rows(~test), self.rows(test)
 
     def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
-        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+        """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
 
         Where some positions were measured, they cover these: rows in sockets are in every ``train``.
-
-        Args:
-            k: number of folds, at least 2.
-            seed: of the shuffle of the groups of repeats.
 
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
@@ -321,15 +288,18 @@ class RowTable(RowGroups):
 
     BY_ROW: ClassVar[tuple[str, ...]] = ()
     """Attributes with a value for each row, all of them tensors (N, ...)."""
-
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
-
     NUMBERED: ClassVar[tuple[str, str]]
     """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
+
+    kind: Any
+    compared: Any
+    """(N, c) numbers in which a row that repeats another one equals it."""
+    ranges: Any
+    """Column, smallest and largest value and their unit, of what was measured."""
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -344,8 +314,18 @@ class RowTable(RowGroups):
     @property
     def columns(self) -> dict[str, Tensor]:
         """The columns that this table has, by name."""
-        found = {name: getattr(self, name) for name in self.BY_ROW}
-        return {name: values for name, values in found.items() if values is not None}
+        return {name: values for name in self.BY_ROW if (values := getattr(self, name)) is not None}
+
+    @property
+    def column_kind(self) -> object:
+        """Key that is equal for tables that can be joined into one."""
+        return self.kind
+
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the device, or of its set-up, of each row; "" without one."""
+        column, names = self.NUMBERED
+        return texts_of(getattr(self, column), getattr(self, names), len(self))
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
@@ -364,10 +344,7 @@ class RowTable(RowGroups):
         """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
 
         Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, known masses as payload, and
-        covariates.
-
-        Raises:
-            ImportError: pandas is not installed.
+        covariates. ImportError if pandas is not installed.
         """
         names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
         payload = {} if self.payload is None else {"payload": self.payload}
@@ -378,25 +355,16 @@ class RowTable(RowGroups):
         """Name -> values (N,) of every column but joints and payloads: what was measured, in SI units and pixels."""
         raise NotImplementedError
 
-    @property
-    def compared(self) -> Tensor:
-        """(N, c) numbers in which a row that repeats another one equals it."""
-        raise NotImplementedError
-
-    @property
-    def ranges(self) -> list[list[str]]:
-        """Column, smallest and largest value and their unit, of what was measured."""
-        raise NotImplementedError
-
-    def warn_if_suspicious(self) -> None:
-        """Warn about exact copies of rows, and about joint values that look like degrees."""
-        pairs = self.copies()
+    def doubted(self, doubt: bool = True) -> Self:
+        """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
+        pairs = self.copies() if doubt else []
         if pairs:
             where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
             text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
             warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-        for text in unlikely_si_joints(self.q, self.joint_names):
+        for text in unlikely_si_joints(self.q, self.joint_names) if doubt else ():
             warn_user(text)
+        return self
 
     @classmethod
     def in_one(cls, tables: Sequence[Self]) -> Self:
@@ -421,15 +389,6 @@ class RowTable(RowGroups):
         return found
 
 
-def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:
-    """Ranges of joints (N, n) in SI units and, as they may turn, in degrees."""
-    found = []
-    for joint, values in enumerate(q.T):
-        turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
-        found.append(value_range(printable(names[joint]) if names else f"joint {joint}", values, turns))
-    return found
-
-
 def value_range(name: str, values: Tensor, unit: str) -> list[str]:
     """The range of one column (N,)."""
     return [name, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", unit]
@@ -443,11 +402,7 @@ def common(values: Sequence[T]) -> T | None:
 
 
 def check_alike(parts: Sequence[RowGroups], by_row: Sequence[str], alike: Sequence[str]) -> None:
-    """Refuse tables that cannot be joined.
-
-    Args:
-        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
-    """
+    """MeasurementError for tables that differ in having columns ``by_row``, or in other attributes ``alike``."""
     for part in parts:
         other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
         other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]

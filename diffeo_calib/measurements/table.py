@@ -28,7 +28,6 @@ from diffeo_calib.measurements.checks import (
     of_measurements,
     seen_markers,
     session_numbers,
-    texts_of,
     tip_names,
 )
 from diffeo_calib.measurements.images import ImageTable
@@ -104,7 +103,6 @@ class Measurements(ImageTable):
     BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
-
     NUMBERED = "session", "session_names"
 
     def __init__(
@@ -127,9 +125,7 @@ class Measurements(ImageTable):
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        if doubt:
-            self.check_every_marker_seen()
-            self.warn_if_suspicious()
+        self.doubted(doubt)
 
     @classmethod
     def from_poses(
@@ -189,11 +185,7 @@ class Measurements(ImageTable):
         )
         data = cls(angles, points, joints, doubt=False)
         found = {"poses": of_frames(frames), "lever": float(lever), "board": board, "std": std, "rotation_std": turns}
-        data = with_attributes(data, **found).with_tips(on)
-        if doubt:
-            data.check_every_marker_seen()
-            data.warn_if_suspicious()
-        return data
+        return with_attributes(data, **found).with_tips(on).doubted(doubt)
 
     @classmethod
     def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
@@ -345,16 +337,6 @@ class Measurements(ImageTable):
         return "position" if self.poses is None else "pose"
 
     @property
-    def column_kind(self) -> object:
-        """Key that is equal for tables that can be joined into one."""
-        return self.kind
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the set-up in which each row was measured, "" without one."""
-        return texts_of(self.session, self.session_names, len(self))
-
-    @property
     def compared(self) -> Tensor:
         """See :class:`RowTable`."""
         return torch.cat([self.q, self.points.flatten(1)], dim=1)
@@ -431,6 +413,12 @@ class Measurements(ImageTable):
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)
         return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
+
+    def doubted(self, doubt: bool = True) -> Measurements:
+        """See :class:`RowTable`; MeasurementError for a marker, or frame, that no row shows."""
+        if doubt:
+            self.check_every_marker_seen()
+        return super().doubted(doubt)
 
     def check_every_marker_seen(self) -> None:
         """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""

@@ -75,11 +75,11 @@ def read_observations(
     data = tables[0] if rows.alone else joined_tables(tables)
     data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
     sha256 = file_sha256(file)
-    data = data.with_file_sha256(sha256)
+    data = data.with_columns(file_sha256=sha256)
     if rows.alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         numbers = replace(numbers, table=replace(numbers.table, marker=marker))
-        data = data.with_origin(TableOrigin(file, numbers, sha256))
+        data = data.with_columns(origin=TableOrigin(file, numbers, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
