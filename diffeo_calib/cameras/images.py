@@ -22,16 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import (
-    BOARD,
-    LENS,
-    BoardPrior,
-    View,
-    board_slopes,
-    project,
-    project_slopes,
-    real_board,
-)
+from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, View, board_slopes, project, project_slopes, real_board
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 

@@ -33,12 +33,7 @@ USUAL_SIZES = {
     "prismatic joints": (100.0, 2.0),
 }
 """Larger values in rad or m, and smaller ones in deg or mm, are probably in the other unit."""
-OTHER_UNITS = {
-    "rad": ("deg", "degrees"),
-    "deg": ("rad", "radians"),
-    "m": ("mm", "millimetres"),
-    "mm": ("m", "metres"),
-}
+OTHER_UNITS = {"rad": ("deg", "degrees"), "deg": ("rad", "radians"), "m": ("mm", "millimetres"), "mm": ("m", "metres")}
 
 
 ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))

@@ -15,14 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
-from diffeo_calib.measurements.rows import (
-    NO_SOCKET,
-    RowGroups,
-    RowTable,
-    check_alike,
-    common,
-    set_attributes,
-)
+from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, RowTable, check_alike, common, set_attributes
 
 WITH_POSITION = ("position", "pose", "mixture")
 """Kinds of rows of which a device measures positions."""

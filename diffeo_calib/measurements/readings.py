@@ -17,14 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.measurements.checks import (
-    arrays_sha256,
-    copied,
-    deviations,
-    joint_table,
-    session_numbers,
-    tip_names,
-)
+from diffeo_calib.measurements.checks import arrays_sha256, copied, deviations, joint_table, session_numbers, tip_names
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
 

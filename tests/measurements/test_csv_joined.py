@@ -116,10 +116,7 @@ def test_recordings_with_clocks_of_their_own(offset: float | None, tmp_path: Pat
     offset = offset or 0.0
     joints = ("t,n,a,c", *(f"{t:.4f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
     seen = at(two)[:, None] * [1.0, 2.0, -3.0] + rng.normal(0.0, 0.01, (len(two), 3))
-    places = (
-        "t,x,y,z",
-        *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)),
-    )
+    places = ("t,x,y,z", *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)))
     found = joined(tmp_path, joints, places, "t")
     rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
     assert 8 <= len(rows) <= 13

@@ -111,10 +111,7 @@ MATRIX = {"rotation": [f"r{i}" for i in range(9)], "convention": "matrix", "rota
         ({"std": ["a"]}, ("distinct columns", "a")),
         ({"std": [["d"], "d"]}, ("`std`",)),
         ({"rotation_std": ["d", "e"]}, ("`rotation_std`", "three, or one for all three axes", "got ['d', 'e']")),
-        (
-            {"rotation_std": ["d", "d", "d"]},
-            ("distinct columns", "d", "the deviations of all axes alone"),
-        ),
+        ({"rotation_std": ["d", "d", "d"]}, ("distinct columns", "d", "the deviations of all axes alone")),
         ({"rotation_std": [["d"], ["e", "f", "g"]]}, ("`rotation_std`", "as many names for every frame", "1 and 3")),
         (QUATERNION | {"rotation_std": ["u", "v", "w"]}, ("`rotation_angle` is missing", "`rotation_std`")),
     ],

@@ -133,8 +133,7 @@ def test_hidden_markers_with_decimal_commas_units_and_deviations(read: Reader) -
 
 
 @pytest.mark.parametrize(
-    ("row", "column"),
-    [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")],
+    ("row", "column"), [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")]
 )
 def test_half_a_marker_is_a_mistake(read: Reader, row: str, column: str) -> None:
     with pytest.raises(MeasurementError, match=says("line 5", column, "an empty cell", "marker or frame are empty")):

@@ -216,11 +216,7 @@ def read_readings(
 
 
 def read_joints(
-    path: str | PathLike[str],
-    joints: Joints,
-    table: TableFormat,
-    *,
-    kinds: Sequence[str] | None = None,
+    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Tensor:
     """Read joint configurations alone from a CSV file, for instance to predict positions.
 
@@ -234,11 +230,7 @@ def read_joints(
 
 
 def read_configurations(
-    path: str | PathLike[str],
-    joints: Joints,
-    table: TableFormat,
-    *,
-    kinds: Sequence[str] | None = None,
+    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
     return read_table(Path(path), Columns.of(table.joints_only(joints, kinds)))[0]

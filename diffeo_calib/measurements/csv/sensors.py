@@ -14,14 +14,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import (
-    DEVIATION,
-    Check,
-    Columns,
-    Group,
-    Reported,
-    Values,
-)
+from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Reported, Values
 from diffeo_calib.measurements.pose_frames import (
     inverse_poses,
     of_frames,
