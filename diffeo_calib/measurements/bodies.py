@@ -25,8 +25,6 @@ from diffeo_calib.measurements.pose_frames import (
     own_blocks,
     points_of_frames,
     pose_jacobian,
-    transforms_of_frames,
-    visible_rotation_numbers,
 )
 from diffeo_calib.measurements.poses import angle_between, check_lever, mark_points, rotation_numbers
 from diffeo_calib.measurements.rows import with_attributes
@@ -98,7 +96,7 @@ class Bodies:
             mean, covariance = model.predict(q, noise=noise)
             return Predicted(mean, mean, covariance, NUMBERS[:3])
         frames, covariance = map(by_frame, model.predict_poses(q, noise=noise))
-        turns = visible_rotation_numbers(frames, "rotvec", "rad")
+        turns = rotation_numbers(frames[..., :3, :3], "rotvec")
         mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2)
         return Predicted(points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
 
@@ -138,8 +136,8 @@ class Bodies:
             return data.points - points
         mean = frames_of_points(points, self.lever)
         shift = data.frames[..., :3, 3] - mean[..., :3, 3]
-        turned = transforms_of_frames(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, data.frames[..., :3, 3])
-        return torch.cat([shift, visible_rotation_numbers(turned, "rotvec", "rad")], 2)
+        turned = rotation_numbers(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, "rotvec")
+        return torch.cat([shift, turned], 2)
 
     def turns(self, data: Any, points: Tensor) -> Tensor:
         """(N, T) angles, rad, from T measured frames to those of points (N, P, 3); T is 0 for markers."""

@@ -150,7 +150,7 @@ class ImageTable(SocketTable):
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Those of images; none of other rows."""
         if self.seen_by is not None and self.pose_shared is not None and self.pose_covariance is not None:
-            slopes = self._pose_slopes()
+            slopes = pose_jacobian(self.frames, self.lever, self.board)[:, 0]
             noise = slopes @ self.pose_covariance @ slopes.mT
             yield SharedErrors(self.cameras, self.seen_by, slopes @ self.pose_shared, noise)
 
@@ -158,7 +158,7 @@ class ImageTable(SocketTable):
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
         if self.pose_larger is None:
             raise AssertionError("a table of images")
-        return self._pose_slopes() @ self.pose_larger
+        return pose_jacobian(self.frames, self.lever, self.board)[:, 0] @ self.pose_larger
 
     def errors_along(self, R: Tensor) -> dict[str, object]:
         """Known errors along axes turned by R (N, 3, 3), as if those of the coordinates were independent."""
@@ -177,9 +177,7 @@ class ImageTable(SocketTable):
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
 
-        Args:
-            q: rad or m. poses: of the board in the camera. errors: as of :func:`~diffeo_calib.cameras.seeing.expected`,
-                those of lens and board as effects (N, 6, c) of unit variance.
+        ``errors``: as of :func:`~diffeo_calib.cameras.seeing.expected`, of lens and board as effects of unit variance.
         """
         on_tool = self.board is not None
         seen = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
@@ -198,9 +196,6 @@ class ImageTable(SocketTable):
         changes = ONE_SESSION | {"poses": of_frames(frames), "points": points_of_frames(frames, self.lever)}
         changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
         return with_attributes(self, **changes, **self.errors_along(R))
-
-    def _pose_slopes(self) -> Tensor:
-        return pose_jacobian(self.frames, self.lever, self.board)[:, 0]
 
 
 class SharedErrors(NamedTuple):

@@ -42,13 +42,12 @@ class Observations(RowGroups):
         tables = [parts[k] for k in order]
         _check_joinable(tables)
         set_attributes(self, parts=tuple(tables), index=tuple(index[k] for k in order))
-        for name in ("joint_names", "payload_at", "covariate_names"):
-            set_attributes(self, **{name: getattr(tables[0], name)})
-        for name in ("file_sha256", "origin"):
-            set_attributes(self, **{name: common([getattr(part, name) for part in tables])})
+        alike = {name: getattr(tables[0], name) for name in ("joint_names", "payload_at", "covariate_names")}
+        alike |= {name: common([getattr(part, name) for part in tables]) for name in ("file_sha256", "origin")}
         for name in ("q", "line_numbers", "payload", "covariates"):
             own = [getattr(part, name) for part in tables]
-            set_attributes(self, **{name: None if own[0] is None else self._whole(own)})
+            alike[name] = None if own[0] is None else self._whole(own)
+        set_attributes(self, **alike)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:

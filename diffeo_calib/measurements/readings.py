@@ -96,15 +96,13 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. lengths: (N,) distances, m, or one for all rows of a ball bar.
-            devices: (N,) name of each row's fixed point; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
+            devices, joint_names: as in :meth:`of`.
             offset_std: standard deviation in m of a length that all readings of a device lack, as those of an
                 interferometer or a wire with an unknown zero; 0 if they are absolute.
-            std: known standard deviations of the lengths, m: one for all, or (N,).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
+            std: known standard deviations of the lengths, m: one for all, or (N,). doubt: as in :meth:`of`.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, a length or deviation that is not positive.
+            MeasurementError: as :meth:`of`, or a length that is not positive.
         """
         if isinstance(offset_std, bool) or not isinstance(offset_std, (int, float)) or not 0.0 <= offset_std < inf:
             fix = "pass metres, or 0 for absolute lengths"
@@ -132,13 +130,7 @@ class Readings(RowTable):
         Args:
             q: (N, n) joint values, rad or m. heights: (N,) m, such as those of a dial gauge; 0 where the ball touched,
                 and the height of a gauge block where it touched this on the same plane.
-            devices: (N,) name of each row's plane; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
-            std: known standard deviations of the heights, m: one for all, or (N,).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
-
-        Raises:
-            MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
+            devices, joint_names, std [m], doubt, errors: as in :meth:`of`.
         """
         return cls.of("height", q, heights, devices, joint_names, std=std, doubt=doubt, name="heights")
 
@@ -159,16 +151,13 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. pixels: (N, 2) column and row in the image, lens distortion removed.
-            devices: (N,) name of each row's camera; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
+            devices, joint_names, doubt: as in :meth:`of`.
             focal: focal lengths fx, fy in pixels. centre: principal point cx, cy in pixels. For tangents of angles
                 in place of pixels pass (1, 1) and (0, 0).
             std: known standard deviations, pixels: one for all, (N,) or (N, 2).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, focal lengths or deviations that are not
-                positive.
+            MeasurementError: as :meth:`of`, or focal lengths that are not positive.
         """
         f = copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
         c = copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
@@ -228,11 +217,7 @@ class Readings(RowTable):
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Any:
-        """The rows of several tables in order: :class:`Readings` of readings of one kind, else :class:`Observations`.
-
-        Raises:
-            MeasurementError: tables that differ in joints or payloads, or whose ball is on several tips.
-        """
+        """The rows of several tables in order: :class:`Readings` of one kind, else :class:`Observations`."""
         return joined_tables(parts)
 
     @property

@@ -43,9 +43,8 @@ from diffeo_calib.measurements.pose_frames import (
     of_frames,
     points_of_frames,
     pose_jacobian,
-    visible_rotation_numbers,
 )
-from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.poses import LEVER, rotation_numbers
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
@@ -376,7 +375,7 @@ class Measurements(ImageTable):
         names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
-            columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
+            columns |= zip(turns, rotation_numbers(self.frames[..., :3, :3], "rotvec").flatten(1).T, strict=False)
         for known, own in ((self.std, names), (self.rotation_std, turns)):
             columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}

@@ -19,9 +19,8 @@ from diffeo_calib.measurements.pose_frames import (
     inverse_poses,
     of_frames,
     transforms_of_frames,
-    visible_rotation_numbers,
 )
-from diffeo_calib.measurements.poses import rotation_matrices
+from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
@@ -180,10 +179,16 @@ class PositionColumns(SensorColumns):
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
         values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
         if frames is not None:
-            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
+            numbers = written_rotations(frames, table)
             values |= {"rotations": numbers, "rotation_std": part.rotation_std}
         texts = {} if self.form.session is None else {self.form.session: part.device_names}
         return values, texts, *part.index
+
+
+def written_rotations(frames: Tensor, table: TableFormat) -> Tensor:
+    """Rotations (N, T, k) of frames (N, T, 4, 4) as a table writes them."""
+    convention, angle = table.convention or "rotvec", table.rotation_angle or "rad"
+    return rotation_numbers(frames[..., :3, :3], convention, angle=angle)
 
 
 def _rotations(rows: FileRows, convention: str) -> Tensor:

@@ -28,9 +28,10 @@ from diffeo_calib.measurements.csv.sensors import (
     numeric_columns,
     sensors_of,
     text_columns,
+    written_rotations,
 )
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers
+from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
@@ -80,8 +81,7 @@ def write_predictions(
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
         values = {"q": q, "points": mean if frames is None else frames[..., :3, 3], "std": spreads[..., :3]}
         if frames is not None:
-            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
-            values |= {"rotations": numbers, "rotation_std": spreads[..., 3:]}
+            values |= {"rotations": written_rotations(frames, table), "rotation_std": spreads[..., 3:]}
         cells = numeric.from_si(values)
         beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
         lines = zip(*(cells[name] for name in names), strict=True)
