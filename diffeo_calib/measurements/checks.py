@@ -67,15 +67,15 @@ def in_other_unit(ratio: float, tolerance: float) -> bool:
     return any(abs(ratio * factor - 1.0) < tolerance for factor in (1e-3, 1e3))
 
 
-def unlikely_units(what: str, largest: float, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
-    """A sentence about values that reach ``largest`` in ``unit``, if that is unusual.
+def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
+    """A sentence about values in ``unit`` whose largest is unusual; none if it is not.
 
     Args:
         what: of USUAL_SIZES. option: argument that names their unit.
         kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
     """
     most, least = USUAL_SIZES[what]
-    small = unit in ("deg", "mm")
+    small, largest = unit in ("deg", "mm"), float(values.abs().max()) if values.numel() else 0.0
     if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]

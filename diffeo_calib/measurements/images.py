@@ -177,7 +177,7 @@ class ImageTable(SocketTable):
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
 
-        ``errors``: as of :func:`~diffeo_calib.cameras.seeing.expected`, of lens and board as effects of unit variance.
+        ``errors``: as of :func:`~diffeo_calib.cameras.images.expected`, of lens and board as effects of unit variance.
         """
         on_tool = self.board is not None
         seen = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)

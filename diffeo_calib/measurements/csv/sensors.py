@@ -14,7 +14,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Reported, Values
+from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Values
 from diffeo_calib.measurements.pose_frames import (
     inverse_poses,
     of_frames,
@@ -84,7 +84,7 @@ class SensorColumns:
     texts: Mapping[str, bool]
     """Columns of texts, and whether a table must have them."""
 
-    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+    def groups(self, table: TableFormat) -> tuple[Group, ...]:
         """The columns of numbers beside joints, positions, payloads and covariates."""
         return ()
 
@@ -300,15 +300,15 @@ class ReadingColumns(SensorColumns):
     def texts(self) -> Mapping[str, bool]:
         return {} if self.device is None else {self.device: True}
 
-    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+    def groups(self, table: TableFormat) -> tuple[Group, Group]:
         unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
         check = LENGTH if self.kind == "distance" and not self.offset_std else None
         names = self.values if isinstance(self.values, tuple) else ()
-        return (Reported(Group(names, unit, check), Group(self.std, unit, DEVIATION), self.word),)
+        return Group(names, unit, check), Group(self.std, unit, DEVIATION)
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
-            return ~rows.values[self.reported(rows.columns.table)[0].values].isnan().any(1)
+            return ~rows.values[self.groups(rows.columns.table)[0]].isnan().any(1)
         if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
@@ -316,19 +316,18 @@ class ReadingColumns(SensorColumns):
 
     def table(self, rows: FileRows) -> Readings:
         q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
-        (own,) = self.reported(table)
+        own, own_std = self.groups(table)
         if isinstance(self.values, tuple):
-            seen = rows.values[own.values]
+            seen = rows.values[own]
         else:
-            seen = own.values.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
+            seen = own.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.values[own.std].expand_as(seen) if self.std else None
+        std = rows.values[own_std].expand_as(seen) if self.std else None
         given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
         if self.kind == "image":
             data = Readings.images(*given, focal=self.intrinsics[:2], centre=self.intrinsics[2:], **known)
         elif self.kind == "distance":
-            largest = float(own.values.from_si(seen).abs().max())
-            for text in unlikely_units("positions", largest, table.length, "length"):
+            for text in unlikely_units("positions", own.from_si(seen), table.length, "length"):
                 warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))
             data = Readings.distances(*given, offset_std=self.offset_std, **known)
         else:
@@ -336,8 +335,8 @@ class ReadingColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on])
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        (own,) = self.reported(table)
-        values = {own.values: part.reported} | ({own.std: part.reported_std} if self.std else {})
+        own, std = self.groups(table)
+        values = {own: part.reported} | ({std: part.reported_std} if self.std else {})
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
@@ -362,8 +361,8 @@ def numeric_columns(table: TableFormat) -> Columns:
     sensors = sensors_of(table)
     _check_options(table, several=len(sensors) != 1)
     table = table if table.position is None else table.for_reading()
-    reported = [one for sensor in sensors for one in sensor.reported(table)]
-    return Columns.of(table, reported, all_hidden=len(sensors) > 1)
+    readings = [(own, sensor.word) for sensor in sensors if (own := sensor.groups(table))]
+    return Columns.of(table, readings, all_hidden=len(sensors) > 1)
 
 
 def _check_options(table: TableFormat, *, several: bool) -> None:

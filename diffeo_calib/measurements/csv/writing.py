@@ -72,10 +72,10 @@ def write_predictions(
     table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
     numeric = numeric_columns(table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table)
-    table, names = numeric.table, [*numeric.joints.columns]
+    table, names, std = numeric.table, [*numeric.joints.columns], numeric.groups["std"].names
     turned = zip(table.rotation or (), table.rotation_std or (), strict=True) if poses else [((), ())] * len(prefixes)
     for k, (triple, (turns, deviations)) in enumerate(zip(numeric.triples, turned, strict=True)):
-        names += [*triple, *numeric.std[3 * k : 3 * k + 3], *turns, *deviations]
+        names += [*triple, *std[3 * k : 3 * k + 3], *turns, *deviations]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
