@@ -174,10 +174,9 @@ class Columns:
             each = [len(group.names) // count for group in measured]  # one for all markers belongs to none
             own = [one._replace(names=one.names[k * n : (k + 1) * n]) for n, one in zip(each, measured, strict=True)]
             found.append(Hideable.of(own, f"shows this {'frame' if self.rotation else 'marker'}", names))
+        others = self.readings if self.all_hidden else ()
         return found + [
-            Hideable.of(own, f"holds {word}", names)
-            for own, word in self.readings
-            if self.all_hidden and own[0].names + own[-1].names
+            Hideable.of(own, f"holds {word}", names) for own, word in others if own[0].names + own[-1].names
         ]
 
     @property

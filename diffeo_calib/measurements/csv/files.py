@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import (
     FileRows,
@@ -69,19 +69,16 @@ def read_observations(
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
-        found = sensor.table(here).with_line_numbers(own.lines)
-        time, temperature = own.values.get("time"), own.values.get("temperature")
-        tables.append(found.with_payload(own.values.get("payload")).with_covariates(time=time, temperature=temperature))
-    data = tables[0] if rows.alone else joined_tables(tables)
-    data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
-    sha256 = file_sha256(file)
-    data = data.with_columns(file_sha256=sha256)
+        found = sensor.table(here).with_line_numbers(own.lines).with_payload(own.values.get("payload"))
+        tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
+    data, sha256 = tables[0] if rows.alone else joined_tables(tables), file_sha256(file)
+    data = (data if rows.alone else data.rows(data.lines.argsort(stable=True))).with_columns(file_sha256=sha256)
     if rows.alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         numbers = replace(numbers, table=replace(numbers.table, marker=marker))
         data = data.with_columns(origin=TableOrigin(file, numbers, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
-    return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
+    return data if duplicates == "keep" else _without_copies(file, data, drop=duplicates == "drop")
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
@@ -101,10 +98,9 @@ def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[Sen
     return [(sensor, rows.of(here)) for sensor, here in zip(sensors, filled, strict=True)]
 
 
-def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: bool) -> Rows:
+def _without_copies(path: Path, data: Rows, drop: bool) -> Rows:
     """Drop or refuse the rows that repeat an earlier one exactly."""
-    copies, count = data.copies(), len(data.q)
-    at = [int(line) for line in lines]
+    copies, at = data.copies(), data.lines.tolist()
     if copies and not drop:
         pairs = few([f"{at[row]} repeats {at[earlier]}" for earlier, row in copies])
         what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {pairs}"
@@ -114,7 +110,7 @@ def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: 
     if dropped:
         text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
         warn_user(f"{text} (line {few([at[row] for row in dropped])}); pass duplicates='keep' to keep them.")
-    return data.rows(np.setdiff1d(np.arange(count), dropped))
+    return data.rows(np.setdiff1d(np.arange(len(data)), dropped))
 
 
 @outside_inference_mode
@@ -180,9 +176,7 @@ def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints
     if joints is None:
         return read_observations(path, table, duplicates=duplicates)
     names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
-    if len(names) != len(joints):
-        got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
-        raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
+    check_count("`joints`", joints, len(names), "joint of the robot, in its order")
     table = replace(table, joints=joints, kinds=table.kinds or kinds)
     return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
 
@@ -218,13 +212,10 @@ def read_readings(
 def read_joints(
     path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Tensor:
-    """Read joint configurations alone from a CSV file, for instance to predict positions.
+    """Joint configurations (N, n), rad (revolute) and m (prismatic), from a CSV file, rows in the order of the file.
 
-    Args, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and decimal
-    mark matter.
-
-    Returns:
-        (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
+    Arguments, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and
+    decimal mark matter.
     """
     return read_configurations(path, joints, table, kinds=kinds)["q"]
 

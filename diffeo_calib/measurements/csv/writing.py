@@ -64,10 +64,6 @@ def write_predictions(
         table: the format, of poses with defaults as in :func:`write_measurements`.
         prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
         poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
-
-    Raises:
-        MeasurementError: unknown unit or convention.
-        InputError: a file that cannot be written.
     """
     table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
@@ -95,10 +91,16 @@ def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable
 
     Texts are written as they are, NaN becomes an empty cell.
     """
+
+    def cell(value: str | float) -> str:
+        if isinstance(value, str):
+            return value
+        return repr(value).replace(".", table.decimal) if isfinite(value) else ""
+
     with WholeFile(path) as file:
         file.write(csv_text([names], table.sep))
         for block in blocks:
-            file.write(csv_text(([_cell(value, table) for value in row] for row in block), table.sep))
+            file.write(csv_text((map(cell, row) for row in block), table.sep))
 
 
 def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
@@ -126,11 +128,7 @@ class Program:
 
     @classmethod
     def read(cls, path: Path, table: TableFormat, wanted: Sequence[str] = ()) -> Program:
-        """Read all cells as text; ``wanted`` are names of columns, by which the header is known.
-
-        Raises:
-            MeasurementError: a file that cannot be read, or lines of different lengths.
-        """
+        """Read all cells as text; ``wanted`` are names of columns, by which the header is known."""
         header, lines = read_cells(path, table.sep, wanted)
         return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
 
@@ -149,22 +147,11 @@ class Program:
     def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
         """Write the program with other and more columns; overwrites.
 
-        Args:
-            path: the file. cells: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
-            table: separator and decimal mark.
-
-        Raises:
-            InputError: a file that cannot be written.
+        ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
         """
         added = {name: own for name, own in cells.items() if name not in self.header}
         kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
         write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
-
-
-def _cell(value: str | float, table: TableFormat) -> str:
-    if isinstance(value, str):
-        return value
-    return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
 
 SOCKET, SESSION = "socket", "session"
