@@ -113,6 +113,13 @@ class Camera:
         real = real_board(points, self.board, self.half_size)
         return project(real @ poses[:, :3, :3].mT + poses[:, None, :3, 3], self.lens)
 
+    @property
+    def corners(self) -> Tensor:
+        """(K, 3) corners of the board as it was meant, m, of a camera with images."""
+        if self.view is None:
+            raise AssertionError("a camera with images")
+        return self.view.points
+
     def entry(self) -> dict[str, object]:
         """For programs: pixels, and ratios of the board."""
         known = zip(UNKNOWNS, self.unknowns.tolist(), self.deviations.tolist(), strict=True)
@@ -207,20 +214,19 @@ def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: Bo
     size = max(one.half_size for one in images)
     known = [first_guess(one, board, size) if own is None else own for one, own in zip(images, cameras, strict=True)]
     first = next((k for k, own in enumerate(cameras) if own is not None and own.half_size), 0)
-    whole = known[first] if known[first].half_size else _with_board(known[first], size, board)
+    whole = known[first]
+    if not whole.half_size:  # its lens is known alone
+        own = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
+        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], own))
     nothing = torch.zeros_like(whole.root[: len(LENS)])
-    lenses = [nothing[:, :0] if k == first else _lens_root(own) for k, own in enumerate(known)]
+    roots = [torch.linalg.qr(own.root[: len(LENS)].mT).R.mT for own in known]  # (9, c) of the lens alone
+    lenses = [nothing[:, :0] if k == first else root for k, root in enumerate(roots)]
     found = []
     for k, (own, others) in enumerate(zip(known, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
         lens = torch.cat([whole.root[: len(LENS)] if k == first else nothing, others], 1)
         root = torch.cat([lens, torch.nn.functional.pad(whole.root[len(LENS) :], (0, others.shape[1]))])
         found.append(replace(own, half_size=whole.half_size, unknowns=torch.cat([own.lens, whole.board]), root=root))
     return found
-
-
-def _lens_root(camera: Camera) -> Tensor:
-    """(9, c) root of the covariance of the lens alone."""
-    return torch.linalg.qr(camera.root[: len(LENS)].mT).R.mT
 
 
 def first_guess(images: Images, board: BoardPrior, half_size: float | None = None) -> Camera:
@@ -244,13 +250,6 @@ def first_guess(images: Images, board: BoardPrior, half_size: float | None = Non
     size = half_size or images.half_size
     root = torch.diag(H.new_tensor([*lens, *board.deviations(size)]))
     return Camera(images.width, images.height, size, unknowns, root)
-
-
-def _with_board(camera: Camera, half_size: float, board: BoardPrior) -> Camera:
-    """A camera of which the lens is known, with a board of which nothing is known."""
-    own = torch.diag(camera.unknowns.new_tensor(board.deviations(half_size)))
-    root = torch.block_diag(camera.root[: len(LENS)], own)
-    return replace(camera, half_size=half_size, root=root)
 
 
 def homographies(images: Images) -> Tensor:
@@ -412,7 +411,8 @@ def _weights(state: State, noise: Tensor | None = None) -> Tensor:
 def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
     parts = [_Normal.of(state, own) for state, own in zip(states, weights, strict=True)]
     root = torch.linalg.inv(torch.linalg.cholesky(_together(parts))).mT  # root root^T = K^-1
-    points, found = _board(states), []
+    every = torch.cat([state.images.points[state.images.seen] for state in states])
+    points, found = every.round(decimals=BOARD_DIGITS).unique(dim=0), []
     for state, own, part in zip(states, weights, parts, strict=True):
         squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
         noise = float((2 * seen.sum() / own.square().sum() / 2).sqrt())
@@ -421,12 +421,6 @@ def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
         rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
         found.append(Sights(camera, state.poses, part.inverse, part.effect @ root, rms))
     return found
-
-
-def _board(states: Sequence[State]) -> Tensor:
-    """(K, 3) all corners that images showed, m."""
-    every = torch.cat([state.images.points[state.images.seen] for state in states])
-    return every.round(decimals=BOARD_DIGITS).unique(dim=0)
 
 
 def _check(images: Images) -> None:
@@ -465,7 +459,7 @@ def shown(camera: Camera, poses: Tensor) -> Tensor:
 
     Far outside of the image, where nothing showed the distortion, it may fold rays back into it.
     """
-    points, size = _corners(camera), camera.unknowns.new_tensor([camera.width - 1, camera.height - 1])
+    points, size = camera.corners, camera.unknowns.new_tensor([camera.width - 1, camera.height - 1])
     edge = undistorted(size * size.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]]), camera.lens).norm(dim=1).max()
     there = points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
     ahead = there[..., :2].norm(dim=-1) <= EDGE_SHARE * edge * there[..., 2]
@@ -480,7 +474,7 @@ def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
         covariance (N, 6, 6) of shift (m) and turn (rad) of the boards in the camera's axes, and effects (N, 6, 14) of
         the errors of lens and board on them.
     """
-    points, parts = _corners(camera), list[tuple[Tensor, Tensor]]()
+    points, parts = camera.corners, list[tuple[Tensor, Tensor]]()
     eye = torch.eye(len(UNKNOWNS), dtype=poses.dtype, device=poses.device)
     whole = replace(camera, root=eye)
     for some in poses.split(MOST_TOGETHER):
@@ -491,9 +485,3 @@ def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
         parts.append((covariance, covariance @ by_pose.mT @ by_unknowns))
     covariances, effects = (torch.cat(each) for each in zip(*parts, strict=True))
     return covariances, effects
-
-
-def _corners(camera: Camera) -> Tensor:
-    if camera.view is None:
-        raise AssertionError("a camera with images")
-    return camera.view.points

@@ -77,11 +77,6 @@ class Bodies:
         return 3 if self.lever is None else 6
 
     @property
-    def kind(self) -> str:
-        """Name of what is measured of them."""
-        return "points" if self.lever is None else "poses"
-
-    @property
     def many(self) -> str:
         """Their name in messages."""
         return "markers" if self.lever is None else "poses"

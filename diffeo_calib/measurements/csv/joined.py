@@ -80,15 +80,11 @@ class _Table(NamedTuple):
 def joined_file(
     joints: Path, places: Path, by: str, sep: str = ",", decimal: str = ".", *, several: bool = False
 ) -> JoinedFile:
-    """A file with the columns of both tables.
+    """A file with the columns of the tables of joints and of places, joined by a common column.
 
-    Args:
-        joints, places: the files. by: the common column. sep, decimal: as of a table; another usual separator of one of
-            the files is found by the common column.
-        several: whether lines of places may share their joint values, as those of markers do.
-
-    Raises:
-        MeasurementError: a file that cannot be read or lacks the column, several partners of a line, or no pair.
+    Another usual separator of one of the files is found by the common column. ``several``: whether lines of places may
+    share their joint values, as those of markers do. MeasurementError for a file that cannot be read or lacks the
+    column, several partners of a line, or no pair.
     """
     tables = table, measured = _Table.read(joints, by, sep), _Table.read(places, by, sep)
     times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
@@ -172,9 +168,9 @@ def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> No
     """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
     table, measured = tables
     kept = [place for place in range(len(measured.header)) if place != measured.by]
-    twice = {*table.header} & {measured.header[place] for place in kept}
-    names = [f"joints.{name}" if name in twice else name for name in table.header]
-    names += [f"places.{name}" if name in twice else name for name in (measured.header[place] for place in kept)]
+    both = ("joints", table.header), ("places", [measured.header[place] for place in kept])
+    twice = {*both[0][1]} & {*both[1][1]}
+    names = [f"{of}.{name}" if name in twice else name for of, own in both for name in own]
     writer, at = csv.writer(file, delimiter=sep, lineterminator="\n"), 2
     writer.writerow(names)
     for row, place in pairs:

@@ -88,21 +88,16 @@ class SensorColumns:
         """The columns of numbers beside joints, positions, payloads and covariates."""
         return ()
 
-    def filled(self, rows: FileRows) -> Tensor:
-        """(N,) boolean, which lines hold such a row."""
-        raise NotImplementedError
+    filled: Any
+    """Lines -> (N,) boolean, which of them hold such a row."""
+    table: Any
+    """Lines, all of which hold one -> their rows."""
+    written: Any
+    """The inverse of ``table``; joints, payloads and covariates are those of the rows."""
 
     def own_lines(self, rows: FileRows) -> FileRows:
         """The line of every row."""
         return rows
-
-    def table(self, rows: FileRows) -> Any:
-        """The rows of these lines, all of which hold one."""
-        raise NotImplementedError
-
-    def written(self, part: Any, table: TableFormat) -> Written:
-        """The inverse of :meth:`table`; joints, payloads and covariates are those of the rows."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -128,21 +123,15 @@ class PositionColumns(SensorColumns):
         """MeasurementError for numbers that do not form a rotation."""
         rows, names = self._with_markers(rows)
         values, columns, table = rows.values, rows.columns, rows.columns.table
-        std, turns = values.get("std"), values.get("rotation_std")
+        q, joints, known = values["q"], columns.joints.texts, [values.get("std"), values.get("rotation_std")]
         if table.convention is None:
-            data = Measurements(values["q"], values["points"], columns.joints.texts, names, std=std, doubt=False)
+            data = Measurements(q, values["points"], joints, names, std=known[0], doubt=False)
         else:
-            single = len(columns.triples) == 1
-            data = Measurements.from_poses(
-                values["q"],
-                of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"])),
-                columns.joints.texts,
-                lever=table.lever,
-                position_std=std[:, 0] if single and std is not None else std,
-                rotation_std=turns[:, 0] if single and turns is not None else turns,
-                camera_on_tool=table.camera_on_tool,
-                doubt=False,
-            )
+            if len(columns.triples) == 1:
+                known = [None if own is None else own[:, 0] for own in known]
+            poses = of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"]))
+            how = {"lever": table.lever, "position_std": known[0], "rotation_std": known[1]}
+            data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=table.camera_on_tool, doubt=False)
         set_ups = rows.devices(self.form.session, "a name")
         return data.with_tips(self.form.on).with_sessions(set_ups, remounted=table.remounted)
 
@@ -179,10 +168,8 @@ class PositionColumns(SensorColumns):
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
         values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
         if frames is not None:
-            numbers = written_rotations(frames, table)
-            values |= {"rotations": numbers, "rotation_std": part.rotation_std}
-        texts = {} if self.form.session is None else {self.form.session: part.device_names}
-        return values, texts, *part.index
+            values |= {"rotations": written_rotations(frames, table), "rotation_std": part.rotation_std}
+        return values, {} if self.form.session is None else {self.form.session: part.device_names}, *part.index
 
 
 def written_rotations(frames: Tensor, table: TableFormat) -> Tensor:
