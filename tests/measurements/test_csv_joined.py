@@ -62,14 +62,6 @@ def test_a_name_in_both_files_says_of_which_it_is(tmp_path: Path) -> None:
     assert header == ["pose", "joints.x", "b", "places.x", "y", "z"]
 
 
-def test_times_more_than_half_a_step_apart_are_no_partners(tmp_path: Path) -> None:
-    joints, places = ("t,a", "0,1", "4,2", "8,3"), ("t,x", "0.5,1", "4.5,2", "11,3")
-    found = joined(tmp_path, joints, ("t,x", "0.5,1", "5.9,2", "8.4,9", "13,3"), by="t")
-    assert [cells[1:] for _, cells in read_cells(found, ",")[1]] == [["1", "1"], ["2", "2"], ["3", "9"]]
-    found = joined(tmp_path, joints, places, by="t")
-    assert [cells[1:] for _, cells in read_cells(found, ",")[1]] == [["1", "1"], ["2", "2"]]
-
-
 def test_several_partners_are_one_error(tmp_path: Path) -> None:
     with pytest.raises(MeasurementError, match=r"places\.csv', line 2, pose p3: expected one partner, got lines 4, 5"):
         joined(tmp_path, joints=(*JOINTS, "p3,7,8"))

@@ -33,12 +33,6 @@ def test_units_are_judged_by_all_rows(tmp_path: Path) -> None:
         read_joints(path, JOINTS, SI)
 
 
-def test_a_cell_with_a_line_break_does_not_shift_the_columns(tmp_path: Path) -> None:
-    path = written(tmp_path, ['"0\n1",0,1,2,3', *lines()])
-    with pytest.raises(MeasurementError, match=says("line 2, column 'q1'", "a number")):
-        read_joints(path, JOINTS, SI)
-
-
 def test_a_pipe_is_read_once(tmp_path: Path) -> None:
     path, pipe = written(tmp_path, lines()), tmp_path / "pipe"
     os.mkfifo(pipe)

@@ -14,13 +14,7 @@ from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
-from diffeo_calib.measurements.table_format import (
-    UNITS_PER_METRE,
-    TableFormat,
-    check_choice,
-    column_names,
-    flat_names,
-)
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
 
 

@@ -15,11 +15,7 @@ from diffeo_calib.common.errors import MeasurementError, as_written, few, shown,
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Values
-from diffeo_calib.measurements.pose_frames import (
-    inverse_poses,
-    of_frames,
-    transforms_of_frames,
-)
+from diffeo_calib.measurements.pose_frames import inverse_poses, of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
