@@ -36,23 +36,19 @@ LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
 
 
 def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], Recording]:
-    """Two topics of a bag.
+    """Two topics of a bag: joint values (T, n), rad or m, their names, and places (T, 3), m, perhaps with quaternions.
 
     Joints are joined by their names over all messages and publishers: each has the times of the messages that hold it,
-    between which its values are interpolated.
+    between which its values are interpolated. Of images there is nothing but times: (T, 0).
 
     Args:
         joints: topic of sensor_msgs/JointState, or TOPIC:NAME,NAME for some of its joints.
         seen: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
             whose motion was measured: TOPIC:CHILD, or TOPIC:PARENT>CHILD for two frames that transforms join.
 
-    Returns:
-        joint values (T, n), rad or m, and the joints' names; places (T, 3), m, with unit quaternions (T, 7) if there
-        are any, or (T, 0) for images.
-
     Raises:
-        InputError: rosbags is missing, or the bag cannot be read. MeasurementError: topics, joints or frames that it
-            does not have, or topics that hold something else.
+        InputError: rosbags is missing, or the bag cannot be read.
+        MeasurementError: topics, joints or frames that it does not have, or topics that hold something else.
     """
     (joints, _, wanted), (seen, _, frames) = (words.partition(":") for words in (joints, seen))
     states, edges, fixed = dict[str, _Rows](), dict[_Edge, _Rows](), set[_Edge]()

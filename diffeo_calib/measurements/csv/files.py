@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
@@ -37,7 +37,7 @@ from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
 from diffeo_calib.robots.se3 import transforms
 
 LOG = logging.getLogger(__name__)
@@ -205,7 +205,16 @@ def read_readings(
     """
     check_choice("kind", kind, ("distance", "height", "image"))
     given = {name: columns.pop(name) for name in ("std", "offset_std", "intrinsics", "on") if name in columns}
-    own = ReadingColumns.checked(kind, values, device=columns.pop("session", None), **given)
+    count, std, lens = 2 if kind == "image" else 1, given.pop("std", None), given.get("intrinsics")
+    if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
+        names = [values] if isinstance(values, str) else values
+        values = column_names("values", names, f"{count} names of columns for {kind!r}", (count,))
+    if (lens is None) != (kind != "image"):
+        fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
+        raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(lens), fix=fix)
+    if std is not None:
+        given["std"] = column_names("std", [std] if isinstance(std, str) else std, "names of columns", (1, count))
+    own = ReadingColumns(kind, values, columns.pop("session", None), **given)
     return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 

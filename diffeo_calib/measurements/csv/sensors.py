@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Values
@@ -20,7 +20,7 @@ from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat, column_names
+from diffeo_calib.measurements.table_format import TableFormat
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
@@ -252,28 +252,6 @@ class ReadingColumns(SensorColumns):
     std: tuple[str, ...] = ()
     on: str | None = None
     unit: tuple[str, float] = MILLIMETRES
-
-    @classmethod
-    def checked(
-        cls,
-        kind: str,
-        values: Any,
-        *,
-        std: Sequence[str] | str | None = None,
-        intrinsics: tuple[float, float, float, float] | None = None,
-        **others: Any,
-    ) -> ReadingColumns:
-        """The columns by names in any form; MeasurementError for a number of them that does not match the kind."""
-        count = 2 if kind == "image" else 1
-        if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
-            given = [values] if isinstance(values, str) else values
-            values = column_names("values", given, f"{count} names of columns for {kind!r}", (count,))
-        if (intrinsics is None) != (kind != "image"):
-            fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
-            raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
-        given = [std] if isinstance(std, str) else std
-        known = () if given is None else column_names("std", given, "names of columns", (1, count))
-        return cls(kind, values, intrinsics=intrinsics or (1.0, 1.0, 0.0, 0.0), std=known, **others)
 
     @property
     def word(self) -> str:
