@@ -75,7 +75,7 @@ def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_k
         kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
     """
     most, least = USUAL_SIZES[what]
-    small, largest = unit in ("deg", "mm"), float(values.abs().max()) if values.numel() else 0.0
+    small, largest = unit in ("deg", "mm"), float(values.nan_to_num(0.0).abs().max()) if values.numel() else 0.0
     if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]

@@ -23,7 +23,6 @@ from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import (
-    FileRows,
     ReadingColumns,
     SensorColumns,
     SocketColumns,
@@ -31,7 +30,7 @@ from diffeo_calib.measurements.csv.sensors import (
     sensors_of,
     text_columns,
 )
-from diffeo_calib.measurements.csv.tables import TableOrigin, read_table
+from diffeo_calib.measurements.csv.tables import FileRows, TableOrigin, read_table
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.readings import Readings
@@ -64,16 +63,15 @@ def read_observations(
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
     sensors, numbers = sensors_of(table), numeric_columns(table)
-    whole = read_table(file, numbers, text_columns(table), zeros=not growing)
-    rows = FileRows(file, numbers, *whole, alone=len(sensors) == 1)
+    rows, alone = read_table(file, numbers, text_columns(table), zeros=not growing), len(sensors) == 1
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
         found = sensor.table(here).with_line_numbers(own.lines).with_payload(own.values.get("payload"))
         tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
-    data, sha256 = tables[0] if rows.alone else joined_tables(tables), file_sha256(file)
-    data = (data if rows.alone else data.rows(data.lines.argsort(stable=True))).with_columns(file_sha256=sha256)
-    if rows.alone and table.position is not None:
+    data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
+    data = (data if alone else data.rows(data.lines.argsort(stable=True))).with_columns(file_sha256=sha256)
+    if alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         numbers = replace(numbers, table=replace(numbers.table, marker=marker))
         data = data.with_columns(origin=TableOrigin(file, numbers, sha256))
@@ -83,7 +81,7 @@ def read_observations(
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
     """Each kind and the lines that hold it; MeasurementError for lines without any."""
-    if rows.alone:
+    if len(sensors) == 1:
         return [(sensors[0], rows)]
     filled = [sensor.filled(rows) for sensor in sensors]
     for sensor in (sensor for sensor, here in zip(sensors, filled, strict=True) if not bool(here.any())):
@@ -233,7 +231,7 @@ def read_configurations(
     path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    return read_table(Path(path), Columns.of(table.joints_only(joints, kinds)))[0]
+    return read_table(Path(path), Columns.of(table.joints_only(joints, kinds))).values
 
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:

@@ -13,7 +13,8 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import Group
-from diffeo_calib.measurements.csv.sensors import FileRows, SensorColumns, Written
+from diffeo_calib.measurements.csv.sensors import SensorColumns, Written
+from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -13,8 +12,8 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
-from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group, Values
+from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group
+from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.pose_frames import inverse_poses, of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
@@ -26,47 +25,6 @@ ONE_READING = "every line is one reading of one device: fill the cell in, or rem
 LENGTH = Check(
     "a distance above 0", fix="repair or remove these lines; distances with an unknown zero are displacements"
 )
-
-
-class FileRows(NamedTuple):
-    """Some lines of a file.
-
-    Args:
-        path: the file. columns: its columns of numbers. values: these in SI. texts: its columns of texts.
-        lines: their numbers in the file.
-        alone: whether all lines of the file hold rows of one kind, so that no cell may be empty.
-    """
-
-    path: Path
-    columns: Columns
-    values: Values
-    texts: Mapping[str, Sequence[str]]
-    lines: Sequence[int]
-    alone: bool
-
-    def of(self, rows: Tensor) -> FileRows:
-        """The lines with these numbers (M,), or those that a mask (N,) chooses."""
-        chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
-        values = {name: own[rows] for name, own in self.values.items()}
-        texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
-        return self._replace(values=values, texts=texts, lines=[self.lines[row] for row in chosen])
-
-    def filled(self, column: str) -> Tensor:
-        """(N,) boolean, which lines have a text in a column."""
-        return torch.tensor([bool(text) for text in self.texts[column]], dtype=torch.bool, device=HOST)
-
-    def named(self, column: str, expected: str, fix: str = "fill it in") -> Sequence[str]:
-        """The texts of a column; MeasurementError for empty ones, which says what is expected and what to do."""
-        empty = [line for line, text in zip(self.lines, self.texts[column], strict=True) if not text]
-        if empty:
-            raise bad_cells(self.path, [(line, column, "") for line in empty], expected, fix)
-        return self.texts[column]
-
-    def devices(self, column: str | None, expected: str, fix: str = "fill it in") -> Sequence[str] | None:
-        """Names of devices or set-ups; None without a column, or where other kinds alone fill it."""
-        if column is None or not (self.alone or any(self.texts[column])):
-            return None
-        return self.named(column, expected, fix)
 
 
 Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]

@@ -79,26 +79,52 @@ MUCH_FARTHER = 3.0
 """Times the largest distance of a row from its nearest one: so far is a single 0, 0, 0 where it is no position."""
 
 
-class Cells(NamedTuple):
-    """The rows of a table: numbers (N, c) as written, NaN where hidden, texts by column, and the lines' numbers."""
+class FileRows(NamedTuple):
+    """Rows of a file.
 
-    numbers: Tensor
-    texts: dict[str, list[str]]
-    lines: list[int]
+    Args:
+        path: the file. columns: its columns of numbers. values: these in SI. texts: its columns of texts.
+        lines: their numbers in the file.
+    """
 
-    def of(self, rows: Sequence[int]) -> Cells:
-        """Some of the rows."""
-        texts = {name: [own[row] for row in rows] for name, own in self.texts.items()}
-        return Cells(self.numbers[rows], texts, [self.lines[row] for row in rows])
+    path: Path
+    columns: Columns
+    values: Values
+    texts: Mapping[str, Sequence[str]]
+    lines: Sequence[int]
+
+    def of(self, rows: Tensor) -> FileRows:
+        """The rows with these numbers (M,), or those that a mask (N,) chooses."""
+        chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
+        values = {name: own[rows] for name, own in self.values.items()}
+        texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
+        return self._replace(values=values, texts=texts, lines=[self.lines[row] for row in chosen])
+
+    def filled(self, column: str) -> Tensor:
+        """(N,) boolean, which rows have a text in a column."""
+        return torch.tensor([bool(text) for text in self.texts[column]], dtype=torch.bool, device=HOST)
+
+    def named(self, column: str, expected: str, fix: str = "fill it in") -> Sequence[str]:
+        """The texts of a column; MeasurementError for empty ones, which says what is expected and what to do."""
+        empty = [line for line, text in zip(self.lines, self.texts[column], strict=True) if not text]
+        if empty:
+            raise bad_cells(self.path, [(line, column, "") for line in empty], expected, fix)
+        return self.texts[column]
+
+    def devices(self, column: str | None, expected: str, fix: str = "fill it in") -> Sequence[str] | None:
+        """Names of devices or set-ups; None without a column, or where other kinds of rows alone fill it."""
+        if column is None or (self.columns.all_hidden and not any(self.texts[column])):
+            return None
+        return self.named(column, expected, fix)
 
 
 def read_table(
     path: Path, columns: Columns, texts: Mapping[str, bool] = MappingProxyType({}), *, zeros: bool = True
-) -> tuple[Values, dict[str, list[str]], list[int]]:
-    """The numbers and the texts of all rows, and the line number of each.
+) -> FileRows:
+    """All rows of a file.
 
     Args:
-        path: the file. columns: which columns of numbers it has, and their units.
+        columns: which columns of numbers it has, and their units.
         texts: columns of texts, "nan" being empty, and whether it must have them.
         zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there.
 
@@ -118,17 +144,20 @@ def read_table(
     cells = [[row[place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
-    whole = Cells(numbers, dict(zip(named, words, strict=True)), list(lines))
-    _check_values(path, columns, whole, file.notes + notes)
+    _check_values(path, columns, numbers, lines)
+    for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
+        warn_user(f"file '{path}': {text}")
+    _check_filled(path, columns, numbers)
     markers = columns.hideable[: len(columns.triples)]
     for own in markers if zeros else ():
-        _hide_zeros(path, columns, whole, own)
-    if markers and not columns.all_hidden:
-        seen = ~torch.stack([numbers[:, own.values].isnan().all(1) for own in markers]).all(0)
-        if gone := [lines[row] for row in (~seen).nonzero()[:, 0].tolist()]:
-            warn_user(f"file '{path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
-        whole = whole.of(seen.nonzero()[:, 0].tolist())
-    return columns.to_si(whole.numbers), whole.texts, whole.lines
+        _hide_zeros(path, columns, numbers, lines, own)
+    whole = FileRows(path, columns, columns.to_si(numbers), dict(zip(named, words, strict=True)), lines)
+    if not markers or columns.all_hidden:
+        return whole
+    seen = ~torch.stack([numbers[:, own.values].isnan().all(1) for own in markers]).all(0)
+    if gone := [lines[row] for row in (~seen).nonzero()[:, 0].tolist()]:
+        warn_user(f"file '{path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
+    return whole.of(seen)
 
 
 def _numbers(
@@ -173,32 +202,32 @@ def _numbers(
     return numbers.masked_fill(gaps, math.nan), notes
 
 
-def _check_values(path: Path, columns: Columns, rows: Cells, notes: Sequence[str]) -> None:
-    """MeasurementError for numbers of a wrong sign, and for columns that are always empty; warnings about units."""
-    for group, values in zip(columns.groups.values(), columns.parts(rows.numbers).values(), strict=True):
+def _check_values(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int]) -> None:
+    """MeasurementError for numbers (N, c) of a wrong sign."""
+    for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
         check = group.check
         wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero().tolist()
         if check is not None and wrong:
-            bad = [(rows.lines[row], group.names[k], f"{float(values[row, k]):g}") for row, k in wrong]
+            bad = [(lines[row], group.names[k], f"{float(values[row, k]):g}") for row, k in wrong]
             raise bad_cells(path, bad, check.expected, check.fix)
-    if notes:
-        warn_user(f"file '{path}': {'; '.join(notes)}")
-    for text in columns.unlikely_units(rows.numbers.nan_to_num(0.0).abs().amax(0, keepdim=True)):
-        warn_user(f"file '{path}': {text}")
+
+
+def _check_filled(path: Path, columns: Columns, numbers: Tensor) -> None:
+    """MeasurementError for a marker, frame or reading that no row shows."""
     for own in columns.hideable:
-        if bool(rows.numbers[:, own.values].isnan().all()):
+        if bool(numbers[:, own.values].isnan().all()):
             names = few([columns.names[place] for place in own.values])
-            what, fix = f"file '{path}', columns {names}: empty in all {len(rows.lines)} lines", "leave them out"
+            what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
 
 
-def _hide_zeros(path: Path, columns: Columns, rows: Cells, own: Hideable) -> None:
+def _hide_zeros(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:
     """Write NaN where a marker is at 0, 0, 0 though it never comes near: a device that does not see it says so.
 
     One such row may be the origin of the frame, or the first pose: then all others must be much farther from it than
     from one another.
     """
-    points, q = rows.numbers[:, own.values[:3]], rows.numbers[:, : len(columns.joints.columns)]
+    points, q = numbers[:, own.values[:3]], numbers[:, : len(columns.joints.columns)]
     lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)]
     some = seen[:FEW_ROWS].unique(dim=0)
     if not bool(lost.any()) or len(some) < 2:
@@ -207,8 +236,8 @@ def _hide_zeros(path: Path, columns: Columns, rows: Cells, own: Hideable) -> Non
     limit = apart.median() if len(q[lost].unique(dim=0)) > 1 else MUCH_FARTHER * apart.amax()
     if bool(seen.norm(dim=1).amin() > limit):
         for place in (*own.values, *own.deviations):
-            rows.numbers[lost, place] = math.nan
-        at = few([rows.lines[row] for row in lost.nonzero()[:, 0].tolist()])
+            numbers[lost, place] = math.nan
+        at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
         names = few([columns.names[k] for k in own.values[:3]])
         warn_user(f"file '{path}': {names} are 0, 0, 0 in line {at}, far from other rows: taken as not seen")
 
