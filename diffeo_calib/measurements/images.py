@@ -13,7 +13,7 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers, texts_of
+from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
@@ -90,8 +90,8 @@ class ImageTable(SocketTable):
             MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane;
                 a camera of which nothing is said.
         """
-        angles, joints = joint_table(q, joint_names)
-        numbers, names = session_numbers(seen_by, len(angles))
+        angles, joints = checks.joint_table(q, joint_names)
+        numbers, names = checks.session_numbers(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
@@ -99,7 +99,7 @@ class ImageTable(SocketTable):
                 "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
             )
             raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
-        check_rows(angles, given, "corners")
+        checks.check_rows(angles, given, "corners")
         given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
         own = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
         found = _sights([given[own == number] for number in range(len(known))], known, board)
@@ -122,7 +122,7 @@ class ImageTable(SocketTable):
     @property
     def camera_names(self) -> list[str]:
         """(N,) name of the camera of each image."""
-        return [] if self.seen_by is None else texts_of(self.seen_by, list(self.cameras), len(self))
+        return [] if self.seen_by is None else checks.texts_of(self.seen_by, list(self.cameras), len(self))
 
     def set_ups(self, names: Sequence[str] | None, *, remounted: bool) -> Sequence[str] | None:
         """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them.

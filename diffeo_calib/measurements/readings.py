@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.measurements.checks import arrays_sha256, copied, deviations, joint_table, session_numbers, tip_names
+from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
 
@@ -159,8 +159,8 @@ class Readings(RowTable):
         Raises:
             MeasurementError: as :meth:`of`, or focal lengths that are not positive.
         """
-        f = copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
-        c = copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
+        f = checks.copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
+        c = checks.copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
         if not bool((f > 0).all()):
             raise MeasurementError.of("`focal`", expected="two positive numbers", got=as_written(f.tolist()))
         seen = cls.of("image", q, pixels, devices, joint_names, std=std, doubt=False, name="pixels", numbers=2)
@@ -202,16 +202,16 @@ class Readings(RowTable):
         Raises:
             MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
-        angles, joints = joint_table(q, joint_names)
+        angles, joints = checks.joint_table(q, joint_names)
         N = len(angles)
         given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values
         shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
-        read = copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
-        whose, names = session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
+        read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
+        whose, names = checks.session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
         if whose is None:
             raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
-        known = deviations(std, "std", read)
+        known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
         return found.doubted(doubt)
 
@@ -245,7 +245,7 @@ class Readings(RowTable):
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         names = {"kind": self.kind.encode(), "names": repr((self.names, self.offset_std)).encode()}
         arrays = {"q": self.q, "values": self.values, "device": self.device, "std": self.std, "payload": self.payload}
-        return self.file_sha256 or arrays_sha256(arrays, names)
+        return self.file_sha256 or checks.arrays_sha256(arrays, names)
 
     @property
     def column_kind(self) -> object:
@@ -290,7 +290,7 @@ class Readings(RowTable):
 
     def with_tips(self, on: Sequence[str] | None) -> Readings:
         """Return the same readings with their ball on this tip, one name, else MeasurementError."""
-        names = tip_names(on, 1)
+        names = checks.tip_names(on, 1)
         return with_attributes(self, on=None if names is None else names[0])
 
     @property

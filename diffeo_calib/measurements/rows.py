@@ -15,17 +15,7 @@ from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import MeasurementError, as_written, printable, warn_user
-from diffeo_calib.measurements.checks import (
-    checked_names,
-    chosen_rows,
-    copied,
-    covariates,
-    numbers_of,
-    of_measurements,
-    payloads,
-    texts_of,
-    unlikely_si_joints,
-)
+from diffeo_calib.measurements import checks
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -138,7 +128,7 @@ class RowGroups:
 
     def with_joint_names(self, names: Sequence[str]) -> Self:
         """The same rows with n distinct names of the joints, else MeasurementError."""
-        return self.with_columns(joint_names=checked_names(names, "names", self.n, "column of `q`"))
+        return self.with_columns(joint_names=checks.checked_names(names, "names", self.n, "column of `q`"))
 
     def with_payload(self, payload: object, at: str | None = None) -> Self:
         """The same rows with a payload of known mass, whose sag a calibration then finds.
@@ -150,7 +140,7 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, negative, or not finite.
         """
-        return self.with_columns(payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+        return self.with_columns(payload=None if payload is None else checks.payloads(payload, self.q), payload_at=at)
 
     def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
         """The same rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
@@ -161,7 +151,7 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, or not finite.
         """
-        return self.with_columns(**covariates({"time": time, "temperature": temperature}, self.q))
+        return self.with_columns(**checks.covariates({"time": time, "temperature": temperature}, self.q))
 
     def with_load(self, load: Payload) -> Self:
         """The same rows with the masses of a payload, if there is one."""
@@ -169,7 +159,7 @@ class RowGroups:
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
         """The same rows with line numbers (N,), which tell where every row comes from, else MeasurementError."""
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        lines = checks.copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
         return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
 
     def copies(self) -> list[tuple[int, int]]:
@@ -322,7 +312,7 @@ class RowTable(RowGroups):
     def device_names(self) -> list[str]:
         """(N,) name of the device, or of its set-up, of each row; "" without one."""
         column, names = self.NUMBERED
-        return texts_of(getattr(self, column), getattr(self, names), len(self))
+        return checks.texts_of(getattr(self, column), getattr(self, names), len(self))
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
@@ -330,7 +320,7 @@ class RowTable(RowGroups):
 
     def rows(self, index: object) -> Self:
         """See :class:`RowGroups`."""
-        chosen = chosen_rows(index, len(self))
+        chosen = checks.chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
@@ -359,7 +349,7 @@ class RowTable(RowGroups):
             where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
             text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
             warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-        for text in unlikely_si_joints(self.q, self.joint_names) if doubt else ():
+        for text in checks.unlikely_si_joints(self.q, self.joint_names) if doubt else ():
             warn_user(text)
         return self
 
@@ -381,7 +371,7 @@ class RowTable(RowGroups):
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
         found = []
         for table in tables:
-            new, numbers = numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
+            new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
             found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
         return found
 
@@ -485,7 +475,7 @@ def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) 
 
 def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes (G,) of the groups, and their numbers (G,) in random order."""
-    with of_measurements():
+    with checks.of_measurements():
         checked_seed = check_seed(seed)
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
