@@ -178,15 +178,12 @@ def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | No
 def sighted_by_several(
     images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior | None = None
 ) -> list[Sights]:
-    """Poses of one board, lenses, and the board, from images of several cameras.
+    """Poses of one board, lenses, and the board, from images of several cameras: the c errors are the same in all.
 
     Args:
         images: of each camera. cameras: what is known of the lens and board of each before; None if nothing is, and of
             the board nothing if its size there is 0. The board is that of the first camera that knows one.
         board: prior of a board of which nothing is known.
-
-    Returns:
-        one for each camera; the c errors, of all lenses and the board, are the same in all of them.
 
     Raises:
         MeasurementError: an image with too few corners, or corners on a line; corners that are no image of the board.
@@ -468,11 +465,9 @@ def shown(camera: Camera, poses: Tensor) -> Tensor:
 
 
 def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Measurements expected from images of boards at poses (N, 4, 4), m, by a camera that has taken images before.
+    """Errors expected of boards at poses (N, 4, 4), m, in images by a camera that has taken images before.
 
-    Returns:
-        covariance (N, 6, 6) of shift (m) and turn (rad) of the boards in the camera's axes, and effects (N, 6, 14) of
-        the errors of lens and board on them.
+    Covariance (N, 6, 6) of shift (m) and turn (rad) in the camera's axes, and effects (N, 6, 14) of lens and board.
     """
     points, parts = camera.corners, list[tuple[Tensor, Tensor]]()
     eye = torch.eye(len(UNKNOWNS), dtype=poses.dtype, device=poses.device)

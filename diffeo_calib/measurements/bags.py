@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def _add_joints(states: dict[str, _Rows], message: Any, topic: str) -> None:
 def _joined(states: Mapping[str, _Rows], wanted: list[str], topic: str) -> tuple[Recording, list[str]]:
     """All joints, or those wanted, at the times of the one in most messages, where messages of all of them span them.
 
-    Unless it is wanted, a joint whose messages span less than half of the time is left out with a warning.
+    Unless wanted, a joint whose messages span less than half of the time is left out with a warning.
     """
     missing = [name for name in wanted if name not in states]
     if missing:
@@ -157,9 +158,7 @@ def _path(edges: Collection[_Edge], parent: str, child: str) -> list[tuple[_Edge
 def read_images(bag: Path, topic: str, times: Collection[float]) -> Iterator[tuple[float, str, bytes]]:
     """The images of some times [s]: time, suffix and content of a file.
 
-    Raises:
-        InputError: OpenCV is missing. MeasurementError: no sensor_msgs/Image or CompressedImage, or an encoding that is
-            not read.
+    InputError if OpenCV is missing, MeasurementError for other messages, or an encoding that is not read.
     """
     for _, message in _messages(bag, (topic,)):
         time = _time(message, topic)
@@ -226,17 +225,14 @@ def _place(message: Any, topic: str) -> list[float]:
     """Place and, if the message has one, rotation; nothing of an image."""
     if hasattr(message, "encoding") or hasattr(message, "format"):
         return []
-    place = next(filter(None, (_part(message, path) for path in PLACES)), None)
+
+    def part(path: str) -> Any:
+        return reduce(lambda own, name: getattr(own, name, None), path.split("."), message)
+
+    place, turn = (next(filter(None, map(part, paths)), None) for paths in (PLACES, TURNS))
     if place is None:
         raise MeasurementError.of(f"messages of {topic}", expected=KINDS, got=message.__msgtype__)
-    turn = next(filter(None, (_part(message, path) for path in TURNS)), None)
     return [place.x, place.y, place.z] + ([] if turn is None else [turn.x, turn.y, turn.z, turn.w])
-
-
-def _part(message: Any, path: str) -> Any:
-    for name in path.split("."):
-        message = getattr(message, name, None)
-    return message
 
 
 def _recording(rows: list[list[float]], topic: str) -> Recording:

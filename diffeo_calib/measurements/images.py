@@ -199,12 +199,9 @@ class ImageTable(SocketTable):
 
 
 class SharedErrors(NamedTuple):
-    """What images of cameras share.
+    """What images (N,) of cameras by name share: the number of each image's camera, and errors of the points of poses.
 
-    Args:
-        cameras: by name. seen_by: (N,) number of the camera of each image.
-        slopes: (N, 9, c) effects of the cameras' c errors of unit variance on the points of poses, m.
-        noise: (N, 9, 9) covariance of the points by the noise of each image, m^2.
+    ``slopes`` (N, 9, c), m, are effects of the cameras' c errors of unit variance, ``noise`` (N, 9, 9), m^2, the own.
     """
 
     cameras: Mapping[str, Camera]

@@ -27,13 +27,7 @@ from diffeo_calib.measurements.table_format import UNITS_PER_METRE, options_of
 
 @dataclass(frozen=True)
 class TableOrigin:
-    """A table in a file, and how it was read.
-
-    Args:
-        path: the file.
-        columns: which of its columns were read, and how.
-        sha256: of its content; None for what can be read only once, such as a pipe.
-    """
+    """A table in a file, which of its columns were read, and how; no SHA-256 of what can be read only once, a pipe."""
 
     path: Path
     columns: Columns
@@ -224,8 +218,7 @@ def _check_filled(path: Path, columns: Columns, numbers: Tensor) -> None:
 def _hide_zeros(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:
     """Write NaN where a marker is at 0, 0, 0 though it never comes near: a device that does not see it says so.
 
-    One such row may be the origin of the frame, or the first pose: then all others must be much farther from it than
-    from one another.
+    One such row may be the frame's origin, or the first pose: all others must be farther from it than from one another.
     """
     points, q = numbers[:, own.values[:3]], numbers[:, : len(columns.joints.columns)]
     lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)]
