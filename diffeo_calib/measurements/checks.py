@@ -98,11 +98,10 @@ def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str
 
 def row_names(names: object, rows: int, what: str) -> list[str]:
     """Names of rows as texts; MeasurementError if not one per row, or for None, NaN or an empty text."""
-    several = isinstance(names, Iterable) and not isinstance(names, str)
-    given = names.tolist() if isinstance(names, Tensor) else list(names) if several else []
-    if not several or len(given) != rows:
-        got = len(given) if several else as_written(names)
-        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got)
+    names = names.tolist() if isinstance(names, Tensor) else names
+    given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
+    if len(given) != rows:
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given) or as_written(names))
     empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
     texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
     unnamed = [row for row, text in enumerate(texts) if not text]

@@ -149,14 +149,14 @@ class ImageTable(SocketTable):
 
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Those of images; none of other rows."""
-        if self.seen_by is not None and self.pose_shared is not None and self.pose_covariance is not None:
-            slopes = pose_jacobian(self.frames, self.lever, self.board)[:, 0]
-            noise = slopes @ self.pose_covariance @ slopes.mT
-            yield SharedErrors(self.cameras, self.seen_by, slopes @ self.pose_shared, noise)
+        shared, own, lever = self.pose_shared, self.pose_covariance, self.lever
+        if self.seen_by is not None and shared is not None and own is not None and lever is not None:
+            slopes = pose_jacobian(self.frames, lever, self.board)[:, 0]
+            yield SharedErrors(self.cameras, self.seen_by, slopes @ shared, slopes @ own @ slopes.mT)
 
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
-        if self.pose_larger is None:
+        if self.pose_larger is None or self.lever is None:
             raise AssertionError("a table of images")
         return pose_jacobian(self.frames, self.lever, self.board)[:, 0] @ self.pose_larger
 

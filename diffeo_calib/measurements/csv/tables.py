@@ -187,7 +187,8 @@ def _numbers(
         bad = [(lines[row], names[k], cells[k][row]) for row, k in wrong]
         raise bad_cells(path, bad, expected, f"remove or repair these lines{hint}")
     words = defaultdict[str, list[int]](list)
-    for row, k in gaps.nonzero().tolist():
+    hidden: list[tuple[int, int]] = gaps.nonzero().tolist()
+    for row, k in hidden:
         if cells[k][row].lower() not in ("", "nan"):
             words[cells[k][row]].append(lines[row])
     said = " and ".join(f"'{shown(text)}' ({len(at)})" for text, at in words.items())
