@@ -18,7 +18,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 

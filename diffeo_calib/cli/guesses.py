@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
-from diffeo_calib.measurements.csv.lines import CsvLines
+from diffeo_calib.measurements.csv.lines import HEAD, CsvLines
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -88,12 +87,12 @@ def guess_sheet(path: Path) -> Sheet:
     """The separator and decimal mark with which most columns are numbers; MeasurementError says why none is right."""
     found, reasons = list[Sheet](), list[tuple[int, MeasurementError]]()
     for sep in SEPARATORS:
-        file = CsvLines(path, sep)
+        width = 0
         try:
-            with file:
-                rows = list(islice((line for block in file.blocks(ROWS_LOOKED_AT) for line in block), ROWS_LOOKED_AT))
+            file = CsvLines(path, sep)
+            width, rows = len(file.header), file.rows(HEAD)[:ROWS_LOOKED_AT]
         except MeasurementError as error:
-            reasons.append((len(file.header), error))
+            reasons.append((width, error))
             continue
         lines, cells = zip(*rows, strict=True)
         columns = {name: texts for name, *texts in zip(file.header, *cells, strict=True) if name}

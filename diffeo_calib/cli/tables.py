@@ -384,8 +384,8 @@ def _number_columns(csv: Path, rows: Rows, table: TableFormat) -> list[str]:
     """The columns of a table, if a reading may be meant as a number or as the name of one."""
     if not csv.is_file() or all(_number(text.partition("=")[2]) is None for text in rows.reading or ()):
         return []
-    with suppress(MeasurementError), CsvLines(csv, table.sep) as file:  # rows may come later
-        return file.header
+    with suppress(MeasurementError):  # rows may come later
+        return CsvLines(csv, table.sep).header
     return []
 
 

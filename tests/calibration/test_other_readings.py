@@ -159,7 +159,7 @@ def test_a_joint_below_the_tip(tmp_path: Path) -> None:
     still = dc.Measurements(turned, short(turned)[:, None, :3, 3] + 1e-5 * torch.rand(40, 1, 3, dtype=torch.float64))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_joints_below_tip(short, still.with_line_numbers(read.line_numbers.tolist()).with_origin(read.origin))
+        warn_of_joints_below_tip(short, still.with_columns(line_numbers=read.line_numbers, origin=read.origin))
 
 
 @pytest.mark.slow

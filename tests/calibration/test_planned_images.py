@@ -18,8 +18,7 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.planning.board_images import BoardImages
 from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
-from diffeo_calib.cameras.images import Images, sighted
-from diffeo_calib.cameras.seeing import expected, sees, shown
+from diffeo_calib.cameras.images import Images, expected, sees, shown, sighted
 from diffeo_calib.campaign.model import with_joints
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.pose_frames import inverse_poses

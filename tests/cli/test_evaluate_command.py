@@ -170,7 +170,7 @@ def test_blocks_do_not_change_predictions_or_errors(
     path, names = site.folder / "model.safetensors", ("whole.csv", "blocks.csv")
     printed = []
     for name, rows in zip(names, (2048, 7), strict=True):
-        monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", rows)
+        monkeypatch.setattr("diffeo_calib.cli.commands.predict.ROWS_AT_ONCE", rows)
         assert command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / name).code == 0
         printed.append(command("evaluate", path, site.csv, *TABLE).out)
     whole, blocks = (
@@ -186,7 +186,7 @@ def test_a_mistake_in_the_last_row_is_found_before_the_first_is_used(
     fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert fitted.code == 0
-    monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", 7)
+    monkeypatch.setattr("diffeo_calib.cli.commands.predict.ROWS_AT_ONCE", 7)
     monkeypatch.setattr(dc.CalibratedKinematics, "predict", lambda *_: pytest.fail("the work has begun"))
     (tmp_path / "old.csv").write_text("old")
     (tmp_path / "bad.csv").write_text(site.csv.read_text() + "1;2;far;4;5;6;7;8;9\n")

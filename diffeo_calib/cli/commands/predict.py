@@ -25,10 +25,11 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
 
+ROWS_AT_ONCE = 2048
+"""A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
     "rigid motion of all of them; `evaluate --register` with measured positions finds it"
