@@ -24,11 +24,11 @@ from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.reductions import backends, keops
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
-from diffeo_calib.kernels.reductions.fused import sums
-from diffeo_calib.kernels.reductions.fused.loops import Program
-from diffeo_calib.kernels.reductions.fused.sums import Fused
-from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions import fused as sums
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
+from diffeo_calib.kernels.reductions.fused import Fused
+from diffeo_calib.kernels.reductions.loops import Program, Vector
+from diffeo_calib.kernels.reductions.symbols import recorded
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 pytest.importorskip("llvmlite")
@@ -308,6 +308,8 @@ def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> N
 def test_code_is_short() -> None:
     """A block of rows has one loop, and every instruction of it is written once per row."""
     inputs = (("features", 3), ("momenta", 3))
-    text, factors = Program(Field(), GaussianProfile(), inputs, Vector(8)).code()
+    weights = recorded(FIELD, GaussianProfile())
+    assert weights is not None
+    text, factors = Program(FIELD, weights, inputs, Vector(8)).code()
     assert factors == [1.0]
     assert text.count("shl <8 x i64>") == 2 * 8

@@ -25,8 +25,8 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import fourier, keops
 from diffeo_calib.kernels.reductions.distributed import Distributed
-from diffeo_calib.kernels.reductions.formulas import Dense, Formula, MatrixPairs, Points
-from diffeo_calib.kernels.reductions.fused.sums import FUSED
+from diffeo_calib.kernels.reductions.formulas import Dense, Formula, Points, matrices
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 Backend = Literal["auto", "dense", "fused", "tiled", "keops", "distributed"]
@@ -164,8 +164,7 @@ def evaluate(
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:
     """The matrix kappa_ij of features (M, D) and (N, D): (M, N), differentiable by autograd."""
     i, j = _centred(Points(rows), Points(columns))
-    e = (j if i is None else i).features
-    return profile.derivatives(MatrixPairs().squared_distance(e, j.features), 0)[0]
+    return profile.derivatives(matrices(j if i is None else i, j)("r2"), 0)[0]
 
 
 def _centred(rows: Points | None, columns: Points) -> tuple[Points | None, Points]:

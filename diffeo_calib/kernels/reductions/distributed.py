@@ -27,7 +27,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.fused.sums import FUSED
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 T = TypeVar("T")

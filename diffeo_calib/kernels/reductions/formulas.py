@@ -17,6 +17,7 @@ column points (and of the row points, where a formula needs them).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple
@@ -76,8 +77,8 @@ class Formula(ABC):
     reads: ClassVar[tuple[str, ...]] = ("features", "momenta")
 
     @abstractmethod
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """The pairwise scalars w_ij, computed by ``pairs`` as matrices or as lazy symbols."""
+    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
+        """The pairwise scalars w_ij from those of :data:`LEAVES`, as matrices or as symbols."""
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
@@ -129,9 +130,9 @@ class Field(Formula):
 
     results = ((Term(0, "momenta"),),)
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
+    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
         """kappa."""
-        return profile.derivatives(pairs.squared_distance(i.features, j.features), 0)
+        return profile.derivatives(leaf("r2"), 0)
 
 
 class FieldAndJacobian(Formula):
@@ -139,9 +140,9 @@ class FieldAndJacobian(Formula):
 
     results = ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),))
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
+    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
         """kappa, kappa'."""
-        return profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
+        return profile.derivatives(leaf("r2"), 1)
 
 
 class Gradient(Formula):
@@ -153,10 +154,10 @@ class Gradient(Formula):
 
     results = ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),))
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
+    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
         """kappa, kappa' s with s = u_i . u_j."""
-        kappa, kappa1 = profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
-        return [kappa, kappa1 * pairs.dot(i.momenta, j.momenta)]
+        kappa, kappa1 = profile.derivatives(leaf("r2"), 1)
+        return [kappa, kappa1 * leaf("s")]
 
 
 class HessianProduct(Formula):
@@ -176,58 +177,51 @@ class HessianProduct(Formula):
     )
     reads = Points._fields
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
+    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
         """kappa, kappa' rho, kappa' s, kappa'' rho s + kappa' ds."""
-        kappa, kappa1, kappa2 = profile.derivatives(pairs.squared_distance(i.features, j.features), 2)
-        rho = pairs.squared_distance_change(i.features, i.d_features, j.features, j.d_features)
-        s = pairs.dot(i.momenta, j.momenta)
-        ds = pairs.dot(pairs.joined(i.d_momenta, i.momenta), pairs.joined(j.momenta, j.d_momenta))
+        kappa, kappa1, kappa2 = profile.derivatives(leaf("r2"), 2)
+        rho, s, ds = leaf("rho"), leaf("s"), leaf("ds")
         return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
 
 
 FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian(), Gradient(), HessianProduct()
 
 
-class Unknown:
-    """A symbol has no value yet: comparing it raises TypeError, where Python's defaults would answer with a guess."""
-
-    __slots__ = ()
-
-    def _refuse(self, *_: object) -> Any:
-        raise TypeError("a pairwise symbol has no value to compare")
-
-    __eq__ = __ne__ = __bool__ = _refuse
+LEAVES = ("r2", "rho", "s", "ds")
+"""Scalars of a pair of points that weights are made of: |E_i - F_j|^2, 2 (E_i - F_j) . (dE_i - dF_j), u_i . u_j and
+du_i . u_j + u_i . du_j."""
 
 
-class MatrixPairs:
-    """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd; all of them are dot products."""
-
-    def dot(self, a: Tensor, b: Tensor) -> Any:
-        """a_i . b_j: (M, k), (N, k) -> (M, N)."""
-        return a @ b.T
-
-    def joined(self, a: Tensor, b: Tensor) -> Tensor:
-        """Vectors one after the other: (M, k), (M, l) -> (M, k + l)."""
-        return torch.cat([a, b], -1)
-
-    def squared_distance(self, e: Tensor, f: Tensor) -> Any:
-        """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
-        e2, f2 = _dots(e, e), _dots(f, f)
-        left = torch.cat([-2.0 * e, e2, torch.ones_like(e2)], -1)  # (M, D + 2)
-        return self.dot(left, torch.cat([f, torch.ones_like(f2), f2], -1))
-
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Any:
-        """2 (e_i - f_j) . (de_i - df_j), the derivative of the squared distance: (M, N)."""
-        ee, ff = 2.0 * _dots(e, de), 2.0 * _dots(f, df)
-        left = torch.cat([-2.0 * e, -2.0 * de, ee, torch.ones_like(ee)], -1)  # (M, 2 D + 2)
-        return self.dot(left, torch.cat([df, f, torch.ones_like(ff), ff], -1))
+def factors(leaf: str, i: Points, j: Points) -> tuple[Tensor, Tensor]:
+    """Vectors (M, k) and (N, k) whose dot products are one of the :data:`LEAVES`, differences up to rounding."""
+    if leaf == "s":
+        return i.momenta, j.momenta
+    if leaf == "ds":
+        return torch.cat([i.d_momenta, i.momenta], -1), torch.cat([j.momenta, j.d_momenta], -1)
+    (e, de), (f, df) = (i.features, i.d_features), (j.features, j.d_features)
+    if leaf == "r2":
+        left, right, e2, f2 = [-2.0 * e], [f], _dots(e, e), _dots(f, f)
+    else:
+        left, right, e2, f2 = [-2.0 * e, -2.0 * de], [df, f], 2.0 * _dots(e, de), 2.0 * _dots(f, df)
+    one_i, one_j = torch.ones_like(e2), torch.ones_like(f2)
+    return torch.cat([*left, e2, one_i], -1), torch.cat([*right, one_j, f2], -1)
 
 
 def _dots(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(-1, keepdim=True)
 
 
-def weighted_sums(weights: list[Tensor], summands: list[Tensor]) -> list[Tensor]:
+def matrices(i: Points, j: Points) -> Callable[[str], Tensor]:
+    """The leaves as materialised (M, N) tensors, differentiable by autograd."""
+
+    def leaf(name: str) -> Tensor:
+        left, right = factors(name, i, j)
+        return left @ right.T
+
+    return leaf
+
+
+def weighted_sums(weights: Sequence[Tensor], summands: list[Tensor]) -> list[Tensor]:
     """[sum_j w_ij b_j], transposed: weights (M, N) and summands (k, N) -> (k, M) each.
 
     On a CPU the product of a large matrix with a few columns is 2 to 3 times faster in this orientation.
@@ -247,6 +241,6 @@ class Dense:
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
         """The results of a formula, M rows each; rows None for the columns themselves."""
         at = columns if rows is None else rows
-        weights = formula.weights(MatrixPairs(), profile, at, columns)
+        weights = formula.weights(matrices(at, columns), profile)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         return formula.finish([s.T for s in weighted_sums(weights, summands)], at)

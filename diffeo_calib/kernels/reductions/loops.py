@@ -10,22 +10,118 @@ columns. Their number is a multiple of :attr:`Program.group`; missing points hav
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
+from math import log
 from typing import NamedTuple
 
-from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import Formula, Points, Term
-from diffeo_calib.kernels.reductions.fused.symbols import Code, Symbol, Vector
+from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula, Points, Term
+from diffeo_calib.kernels.reductions.symbols import Weights
 
 ROWS = ((4, 8), (12, 4), (32, 2))
 """Sums of a row, and the number of rows of a block up to it; beyond it one row. Measured with 16 and 32 registers."""
-Factors = tuple[str, str]
-"""Names of two values that are multiplied."""
-LOOPS = {"symmetric": 7, "rectangular": 9}
-"""Functions of a program, and the number of their arguments."""
+ARGUMENTS = 10
+"""Of the function of a program."""
+EXP2 = (
+    1.0,
+    0.6931471805599516,
+    0.24022650695910472,
+    0.05550410866434658,
+    0.009618129107380715,
+    0.001333355824648072,
+    0.00015403530800818256,
+    1.525264774769592e-05,
+    1.321523563477604e-06,
+    1.0210506458816145e-07,
+    7.111758687557852e-09,
+)
+"""Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16."""
+BIAS, FRACTION_BITS = 1023, 52
+"""Of a double."""
+
+
+@dataclass(frozen=True)
+class Vector:
+    """The type of a vector of so many doubles."""
+
+    lanes: int
+
+    def __str__(self) -> str:
+        return f"<{self.lanes} x double>"
+
+    @property
+    def suffix(self) -> str:
+        """Of the names of functions of such vectors."""
+        return f"v{self.lanes}f64"
+
+
+class Code:
+    """A list of instructions. The same operation on the same values is written once.
+
+    Args:
+        vector: the type of most values. numbers: of names, shared by all lists of a function.
+    """
+
+    def __init__(self, vector: Vector, numbers: Iterator[int]) -> None:
+        self.vector, self.numbers = vector, numbers
+        self.lines: list[str] = []
+        self.known: dict[str, str] = {}
+
+    def name(self) -> str:
+        """A new name."""
+        return f"%v{next(self.numbers)}"
+
+    def value(self, instruction: str) -> str:
+        """Name of the result of an instruction."""
+        if instruction not in self.known:
+            self.known[instruction] = self.name()
+            self.lines.append(f"  {self.known[instruction]} = {instruction}")
+        return self.known[instruction]
+
+    def constant(self, number: float) -> str:
+        """A vector of equal numbers."""
+        bits = f"double 0x{struct.pack('>d', number).hex().upper()}"
+        return f"<{', '.join([bits] * self.vector.lanes)}>"
+
+    def call(self, operation: str, a: str, b: str) -> str:
+        """An operation on two vectors."""
+        return self.value(f"{operation} {self.vector} {a}, {b}")
+
+    def fused(self, a: str, b: str, c: str) -> str:
+        """a b + c."""
+        v = self.vector
+        return self.value(f"call {v} @llvm.fmuladd.{v.suffix}({v} {a}, {v} {b}, {v} {c})")
+
+    def bounded(self, x: str, limit: str, side: str) -> str:
+        """The limit where x is below ("olt") or above ("ogt") it; NaN stays NaN."""
+        v = self.vector
+        beyond = self.value(f"fcmp {side} {v} {x}, {limit}")
+        return self.value(f"select <{v.lanes} x i1> {beyond}, {v} {limit}, {v} {x}")
+
+    def exp(self, x: str, number: float, positive: bool) -> str:
+        """exp(number x); beyond the range of powers of two 0 or infinity; whether x is known not to be negative."""
+        factor = number / log(2.0)
+        above, below = not positive or factor > 0.0, not positive or factor < 0.0
+        # without a fraction, an exponent of zeros is 0 and one of ones is infinite
+        for cut, limit in ((above, (BIAS + 1) / factor), (below, -BIAS / factor)):
+            if cut:
+                x = self.bounded(x, self.constant(limit), "ogt" if limit > 0 else "olt")
+        v, c = self.vector, self.constant(factor)
+        # adding it rounds to integers, in the last bits of the sum: those of an exponent
+        shift = self.constant(1.5 * 2.0**FRACTION_BITS + BIAS)
+        moved = self.fused(x, c, shift)
+        f = self.fused(x, c, self.value(f"fneg {v} {self.call('fsub', moved, shift)}"))
+        p, *rest = (self.constant(c) for c in reversed(EXP2))
+        for c in rest:
+            p = self.fused(p, f, c)
+        whole = f"<{v.lanes} x i64>"
+        power = self.value(f"bitcast {v} {moved} to {whole}")
+        places = f"<{', '.join([f'i64 {FRACTION_BITS}'] * v.lanes)}>"
+        power = self.value(f"bitcast {whole} {self.value(f'shl {whole} {power}, {places}')} to {v}")
+        return self.call("fmul", p, power)  # a product, so that NaN stays NaN whatever its bits
 
 
 @dataclass(frozen=True)
@@ -38,7 +134,7 @@ class Program:
     """
 
     formula: Formula
-    profile: Profile
+    weights: Weights
     inputs: tuple[tuple[str, int], ...]
     vector: Vector
 
@@ -69,47 +165,77 @@ class Program:
         return max(self.vector.lanes, self.rows)
 
     def code(self) -> tuple[str, list[float]]:
-        """The module, and the factors of the results, 0 for those that vanish.
-
-        Raises:
-            TypeError, AttributeError: the profile uses other operations than those of :class:`Symbol`.
-        """
+        """The module, and the factors of the results, 0 for those that vanish."""
         plain, mirrored = _Block(self, mirrored=False), _Block(self, mirrored=True)
         declared = DECLARATIONS.format(v=self.vector, suffix=self.vector.suffix)
-        drivers = DRIVERS.format(rows=self.rows, group=self.group)
-        text = "\n".join([declared, plain.text("plain"), mirrored.text("mirrored"), drivers])
+        driver = DRIVER.format(rows=self.rows, group=self.group)
+        text = "\n".join([declared, plain.text("plain"), mirrored.text("mirrored"), driver])
         return text, [result.factor for result in plain.results]
 
 
-class SymbolicPairs:
-    """Pairwise scalars of a row and a vector of columns, as symbols."""
+class _Lowering:
+    """Weights of a row and a vector of columns, as instructions.
 
-    def __init__(self, code: Code) -> None:
-        self.code = code
+    Args:
+        code: where they are written. i, j: names of the points' coordinates.
+    """
 
-    def joined(self, a: list[str], b: list[str]) -> list[str]:
-        """Vectors one after the other."""
-        return a + b
+    def __init__(self, code: Code, weights: Weights, i: Points, j: Points) -> None:
+        self.code, self.i, self.j, self.known, v = code, i, j, {}, code.vector
+        for k, (name, operands, number) in weights.steps():
+            a, *b = (self.known[o] for o in operands) if operands else ("",)
+            if name in LEAVES:
+                found = self._leaf(name)
+            elif name == "relu" and weights.nodes[operands[0]].name == "r2":
+                found = a  # a sum of squares here
+            elif name in ("product", "ratio"):
+                found = code.call("fmul" if name == "product" else "fdiv", a, b[0])
+            elif name == "sum" and abs(number) == 1.0:
+                found = code.call("fadd" if number > 0.0 else "fsub", a, b[0])
+            elif name == "sum":
+                found = code.fused(b[0], code.constant(number), a)
+            elif name in ("shift", "scale"):
+                found = code.call("fadd" if name == "shift" else "fmul", a, code.constant(number))
+            elif name == "inverse":
+                found = code.call("fdiv", code.constant(1.0), a)
+            elif name == "exp":
+                found = code.exp(a, number, weights.positive[operands[0]])
+            elif name == "sqrt":
+                found = code.value(f"call {v} @llvm.sqrt.{v.suffix}({v} {a})")
+            else:
+                found = code.bounded(a, code.constant(0.0), "olt")
+            self.known[k] = found
+        self.results = [(None if node is None else self.known[node], scale) for node, scale in weights.results]
 
-    def apart(self, e: list[str], f: list[str]) -> list[str]:
-        """e_i - f_j."""
-        return [self.code.call("fsub", a, b) for a, b in zip(e, f, strict=True)]
+    def weight(self, number: int, factor: float) -> str:
+        """A weight times a number."""
+        value, scale = self.results[number]
+        constant = self.code.constant(scale * factor)
+        if value is None:
+            return constant
+        return value if scale * factor == 1.0 else self.code.call("fmul", value, constant)
 
-    def dot(self, a: list[str], b: list[str]) -> Symbol:
-        """a_i . b_j."""
+    def apart(self, field: str) -> list[str]:
+        """e_i - f_j of a field."""
+        pairs = zip(getattr(self.i, field), getattr(self.j, field), strict=True)
+        return [self.code.call("fsub", a, b) for a, b in pairs]
+
+    def _leaf(self, name: str) -> str:
+        i, j = self.i, self.j
+        if name == "s":
+            return self._dot(i.momenta, j.momenta)
+        if name == "ds":
+            return self._dot([*i.d_momenta, *i.momenta], [*j.momenta, *j.d_momenta])
+        apart = self.apart("features")
+        if name == "r2":
+            return self._dot(apart, apart)
+        return self.code.call("fmul", self._dot(apart, self.apart("d_features")), self.code.constant(2.0))
+
+    def _dot(self, a: list[str], b: list[str]) -> str:
         total = self.code.call("fmul", a[0], b[0])
         for one, other in zip(a[1:], b[1:], strict=True):
             total = self.code.fused(one, other, total)
-        return Symbol(self.code, total, positive=a is b)
-
-    def squared_distance(self, e: list[str], f: list[str]) -> Symbol:
-        """|e_i - f_j|^2."""
-        apart = self.apart(e, f)
-        return self.dot(apart, apart)
-
-    def squared_distance_change(self, e: list[str], de: list[str], f: list[str], df: list[str]) -> Symbol:
-        """2 (e_i - f_j) . (de_i - df_j)."""
-        return self.dot(self.apart(e, f), self.apart(de, df)) * 2.0
+        return total
 
 
 class _Result(NamedTuple):
@@ -147,12 +273,9 @@ class _Block:
         points = [self._points(lambda k, r=r: self._spread(k, f"%i{r}")) for r in rows]
         columns = self._points(self._column)
         codes = [Code(self.vector, numbers) for _ in rows]
-        weights = [
-            program.formula.weights(SymbolicPairs(code), program.profile, i, columns)
-            for code, i in zip(codes, points, strict=True)
-        ]
+        lowered = [_Lowering(code, program.weights, i, columns) for code, i in zip(codes, points, strict=True)]
         self.loop.lines += [line for lines in zip(*[code.lines for code in codes], strict=True) for line in lines]
-        self.results = self._results(weights[0])
+        self.results = self._results()
         self.starts = [[f"%s{r}_{k}" for k in range(program.count)] for r in rows]
         self.sums = [list(names) for names in self.starts]
         self.shares = [self.loop.constant(0.0)] * len(self.sums[0])
@@ -161,8 +284,7 @@ class _Block:
         for result in self.results:
             for term in result.terms:
                 for r in rows:
-                    weight = weights[r][term.weight] * (term.factor / result.factor)
-                    products = self._products(term, weight, points[r], columns)
+                    products = self._products(term, lowered[r], term.factor / result.factor)
                     for k, (ours, theirs) in zip(result.places, products, strict=True):
                         self.sums[r][k] = codes[r].fused(*ours, self.sums[r][k])
                         if mirrored:
@@ -191,11 +313,11 @@ class _Block:
             tail="\n".join(self.tail.lines),
         )
 
-    def _results(self, weights: list[Symbol]) -> list[_Result]:
-        found, place = [], 0
+    def _results(self) -> list[_Result]:
+        found, place, scales = [], 0, [scale for _, scale in self.program.weights.results]
         for terms, size in zip(self.program.formula.results, self.program.outputs, strict=True):
-            present = [t for t in terms if weights[t.weight].scale != 0.0]
-            factor = weights[present[0].weight].scale * present[0].factor if present else 0.0
+            present = [t for t in terms if scales[t.weight] != 0.0]
+            factor = scales[present[0].weight] * present[0].factor if present else 0.0
             found.append(_Result(range(place, place + size), factor, present, terms[0].apart is not None))
             place += size
         return found
@@ -225,17 +347,17 @@ class _Block:
         address = self._address(self.loop, k, _Place("%columns", "%n", "%j"))
         return self.loop.value(f"load {self.vector}, ptr {address}, align 8")
 
-    def _products(self, term: Term, weight: Symbol, i: Points, j: Points) -> list[tuple[Factors, Factors]]:
+    def _products(self, term: Term, at: _Lowering, factor: float) -> list[tuple[tuple[str, str], tuple[str, str]]]:
         """Factors of what a term adds to each sum of a row, and to the column's, but for the sign of differences."""
-        code, w = weight.code, weight.plain
+        code, w = at.code, at.weight(term.weight, factor)
         ours, theirs = [w], [w]
         if term.vector is not None:
-            ours, theirs = getattr(j, term.vector), getattr(i, term.vector)
+            ours, theirs = getattr(at.j, term.vector), getattr(at.i, term.vector)
             if term.apart is None:
                 return [((w, b), (w, c)) for b, c in zip(ours, theirs, strict=True)]
             ours = [code.call("fmul", w, b) for b in ours]
             theirs = [code.call("fmul", w, c) for c in theirs] if self.mirrored else ours
-        apart = SymbolicPairs(code).apart(getattr(i, term.apart or ""), getattr(j, term.apart or ""))
+        apart = at.apart(term.apart or "")
         return [((a, d), (b, d)) for a, b in zip(ours, theirs, strict=True) for d in apart]
 
     def _store_shares(self, result: _Result) -> None:
@@ -288,63 +410,38 @@ end:
   ret void
 }}
 """
-DRIVERS = """
-define void @symmetric(ptr %points, i64 %n, i64 %s, ptr %out, ptr %tiles, i64 %count, i64 %side) #0 {{
+DRIVER = """
+define void @sums(ptr %rows, i64 %m, ptr %columns, i64 %n, i64 %s, ptr %out, i64 %first, i64 %last, i64 %side,
+                  i64 %mirrored) #0 {{
 entry:
-  br label %tile
-tile:
-  %t = phi i64 [ 0, %entry ], [ %t1, %tile.next ]
-  %place = getelementptr i64, ptr %tiles, i64 %t
-  %number = load i64, ptr %place
-  %a0 = mul i64 %number, %side
-  %a1.far = add i64 %a0, %side
-  %a1 = call i64 @llvm.smin.i64(i64 %a1.far, i64 %n)
+  %triangle = icmp ne i64 %mirrored, 0
+  %start = select i1 %triangle, i64 %first, i64 0
   br label %column
 column:
-  %b0 = phi i64 [ %a0, %tile ], [ %b1.far, %column.next ]
+  %b0 = phi i64 [ %start, %entry ], [ %b1.far, %column.next ]
   %b1.far = add i64 %b0, %side
   %b1 = call i64 @llvm.smin.i64(i64 %b1.far, i64 %n)
-  %own = icmp eq i64 %a0, %b0
+  %own = icmp eq i64 %b0, %first
   br label %row
 row:
-  %i = phi i64 [ %a0, %column ], [ %i1, %row.next ]
+  %i = phi i64 [ %first, %column ], [ %i1, %row.next ]
   %i1 = add i64 %i, {rows}
-  br i1 %own, label %diagonal, label %row.next
+  br i1 %triangle, label %half, label %all
+all:
+  call void @plain(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %b0, i64 %b1)
+  br label %row.next
+half:
+  br i1 %own, label %diagonal, label %mirror
 diagonal:
   %g0 = and i64 %i, -{group}
   %g1 = add i64 %g0, {group}
-  call void @plain(ptr %points, i64 %s, ptr %points, i64 %s, ptr %out, i64 %i, i64 %g0, i64 %g1)
+  call void @plain(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %g0, i64 %g1)
+  br label %mirror
+mirror:
+  %low = phi i64 [ %b0, %half ], [ %g1, %diagonal ]
+  call void @mirrored(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %low, i64 %b1)
   br label %row.next
 row.next:
-  %low = phi i64 [ %b0, %row ], [ %g1, %diagonal ]
-  call void @mirrored(ptr %points, i64 %s, ptr %points, i64 %s, ptr %out, i64 %i, i64 %low, i64 %b1)
-  %row.more = icmp slt i64 %i1, %a1
-  br i1 %row.more, label %row, label %column.next
-column.next:
-  %column.more = icmp slt i64 %b1.far, %n
-  br i1 %column.more, label %column, label %tile.next
-tile.next:
-  %t1 = add i64 %t, 1
-  %tile.more = icmp slt i64 %t1, %count
-  br i1 %tile.more, label %tile, label %end
-end:
-  ret void
-}}
-
-define void @rectangular(
-  ptr %rows, i64 %m, ptr %columns, i64 %n, i64 %s, ptr %out, i64 %first, i64 %last, i64 %side
-) #0 {{
-entry:
-  br label %column
-column:
-  %b0 = phi i64 [ 0, %entry ], [ %b1.far, %column.next ]
-  %b1.far = add i64 %b0, %side
-  %b1 = call i64 @llvm.smin.i64(i64 %b1.far, i64 %n)
-  br label %row
-row:
-  %i = phi i64 [ %first, %column ], [ %i1, %row ]
-  call void @plain(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %b0, i64 %b1)
-  %i1 = add i64 %i, {rows}
   %row.more = icmp slt i64 %i1, %last
   br i1 %row.more, label %row, label %column.next
 column.next:
@@ -354,4 +451,5 @@ end:
   ret void
 }}
 """
-"""Tiles of a part of the sums: of a triangle, where the points of a diagonal group meet all of their group; of rows."""
+"""Rows ``first`` to ``last`` with all columns; or a row of tiles of a triangle, from the diagonal on, where points of
+a diagonal group meet all of their group, and later points count both ways."""
