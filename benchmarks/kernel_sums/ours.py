@@ -106,7 +106,7 @@ class PlainTiles(TiledSums):
         for a, i in enumerate(tiles):
             points = columns.rows(i)
             for j in tiles[a:]:
-                weights = formula.weights(matrices(points, columns.rows(j)), profile)
+                weights = formula.weigh(matrices(points, columns.rows(j)), profile)
                 for total, w, b in zip(totals, weights, summands, strict=True):
                     total[:, i] += b[:, j] @ w.T
                     if i != j:

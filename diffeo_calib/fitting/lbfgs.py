@@ -21,7 +21,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.fitting.objective import Objective, Start, slope
+from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -71,8 +71,8 @@ class LBFGS:
         Raises:
             NumericalError: the flows of the start overflow.
         """
-        begin = Start(start) if start is not None else problem.start(integrator)
-        run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
+        begin, evaluations = (start, 0) if start is not None else problem.start(integrator)
+        run = _Run(problem, integrator, begin, self.history_size, evaluations=evaluations)
         run.begin()
         try:
             return self._iterate(run, progress)

@@ -19,7 +19,7 @@ from diffeo_calib.common.checks import as_tensor, check_count, check_covariance,
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.objective import Objective, Start, linear_optimum
+from diffeo_calib.fitting.objective import Objective, linear_optimum
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -185,7 +185,6 @@ class Problem(Objective[GeodesicDeformation]):
         return other
 
     def zero(self) -> Momenta:
-        """No deformation: k1 = k0."""
         m = self.y.shape[1] if self.observe is None else self.observe.dim
         points = len(self.controls) * (m // self.spec.task_dim)
         return Momenta(
@@ -198,12 +197,11 @@ class Problem(Objective[GeodesicDeformation]):
         """Run both flows for these momenta; pass ``variational`` if the result will be linearised."""
         return GeodesicDeformation(self.spec, self.controls, momenta, integrator, variational=variational)
 
-    def start(self, integrator: Integrator) -> Start:
+    def start(self, integrator: Integrator) -> tuple[Momenta, int]:
         """The tangent solution."""
-        return Start(linear_optimum(self, self.deform(self.zero(), RK4(1)))[0])
+        return linear_optimum(self, self.deform(self.zero(), RK4(1)))[0], 0
 
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """All momenta are free."""
         return momenta
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:

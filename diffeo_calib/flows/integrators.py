@@ -143,7 +143,6 @@ class RungeKutta(Integrator):
 
     @property
     def intervals(self) -> int:
-        """The number of steps."""
         return self.steps
 
     @property
@@ -152,7 +151,6 @@ class RungeKutta(Integrator):
         return 1.0 / (1.0 - 2.0**-self.order)
 
     def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
-        """The states at the steps + 1 nodes."""
         coefficients, weights = (t.to(state) / self.steps for t in self.tableau())
         states = [state]
         for step in range(self.steps):
@@ -163,7 +161,6 @@ class RungeKutta(Integrator):
         return states
 
     def refined(self) -> RungeKutta:
-        """The same method with twice the steps."""
         return type(self)(2 * self.steps)
 
 

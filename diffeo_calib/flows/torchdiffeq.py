@@ -66,7 +66,6 @@ class TorchDiffEq(Integrator):
 
     @property
     def intervals(self) -> int:
-        """1 / step_size."""
         return round(1.0 / self.step_size)
 
     @property

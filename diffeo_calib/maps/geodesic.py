@@ -60,7 +60,6 @@ class GeodesicDeformation(Deformation):
 
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
-        """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
         return torch.cat([self._values(x[rows], self.spec.nominal.rows(rows)) for rows in row_blocks(x)])
 
     def _values(self, x: Tensor, nominal: NominalMap) -> Tensor:
@@ -68,7 +67,6 @@ class GeodesicDeformation(Deformation):
         return self.task_flow(self._points(z0)).reshape(z0.shape)
 
     def at_controls(self, x: Tensor) -> Tensor | None:
-        """The end of the controls' own flows; see :meth:`Deformation.at_controls`."""
         same = self.spec.nominal is self._nominal_of_z1 and x.device == self.x.device and torch.equal(x, self.x)
         return self.z1.detach().clone() if same else None
 
@@ -81,22 +79,18 @@ class GeodesicDeformation(Deformation):
         return self._apply_blocks(d_psi, self.spec.nominal.jacobian(xi, self.momenta.theta) @ d_phi)
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
-        """1/2 b^T K_V b and 1/2 p^T K_W p, differentiable once in b and p."""
         spec, (b, p, _) = self.spec, self.momenta.tensors
         return energy(spec.joint_kernel, self.x, b), energy(spec.task_kernel, self.z0.reshape(p.shape), p)
 
     @property
     def task_controls(self) -> Tensor:
-        """z0 as points: (N P, d)."""
         return self._points(self.z0)
 
     @property
     def end_momenta(self) -> Tensor:
-        """p at the end of the task-space geodesic: (N P, d)."""
         return self.task_flow.end[1]
 
     def coupling_residual(self) -> float:
-        """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
         p = self.momenta.task.reshape(self.z1.shape)
         b_end = self.joint_flow.end[1]
         return relative(b_end - (self._slopes.mT @ p[:, :, None])[:, :, 0], b_end)
@@ -111,7 +105,6 @@ class GeodesicDeformation(Deformation):
         return max(self.joint_flow.energy_drift(), self.task_flow.energy_drift())
 
     def to(self, device: torch.device | str) -> GeodesicDeformation:
-        """The same deformation with its flows on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return GeodesicDeformation(*moved, self.integrator)
 

@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
-from diffeo_calib.fitting.objective import Objective, Start, tangent
+from diffeo_calib.fitting.objective import Objective, tangent
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
@@ -235,17 +235,14 @@ class EulerianDeformation(Deformation):
         return self.flow(self._start(x), x)[1]
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
-        """The first two terms of (16), differentiable in P0."""
         return self._energies(self.flow.nodes[0])
 
     @property
     def task_controls(self) -> Tensor:
-        """k0 at the data, as points: (N P, d)."""
         return self.flow.unpack(self.flow.nodes[0])[0].reshape(self.momenta.task.shape)
 
     @property
     def end_momenta(self) -> Tensor:
-        """P at time 1: (N P, d)."""
         return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
 
     def coupling_residual(self) -> float:
@@ -258,7 +255,6 @@ class EulerianDeformation(Deformation):
         return abs(end - start) / start if start > 0 else 0.0
 
     def to(self, device: torch.device | str) -> EulerianDeformation:
-        """The same deformation with its flow on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return EulerianDeformation(*moved, self.integrator, self.equations)
 
@@ -341,15 +337,12 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
 
     def zero(self) -> Momenta:
-        """P0 = 0: k1 = k0."""
         return self.unknowns(self.exact.zero())
 
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """P0 and theta; b is implied."""
         return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
 
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
-        """Solve (17) and (19) for these momenta."""
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
@@ -365,7 +358,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
     def _conditional(self) -> DataConditional:
         return tangent(self.exact).conditional
 
-    def start(self, integrator: Integrator) -> Start:
+    def start(self, integrator: Integrator) -> tuple[Momenta, int]:
         """Shoot at (12) from P0 = 0 as long as the energy falls."""
         at, evaluations = self.zero(), 1
         deformation = self.deform(at, integrator)
@@ -381,7 +374,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
             if found is None:
                 break
             at, (deformation, best) = trial, found
-        return Start(at, evaluations)
+        return at, evaluations
 
     def _better(self, at: Momenta, integrator: Integrator, best: float) -> tuple[EulerianDeformation, float] | None:
         """The deformation of these momenta and its energy; None unless the energy is below ``best``."""

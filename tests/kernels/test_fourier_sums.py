@@ -16,7 +16,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, fourier
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Field, Formula, Points
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Formula, Points
 
 ACCURACIES = (1e-2, 1e-4, 1e-7)
 COUNT = 4000
@@ -34,7 +34,7 @@ def cloud(count: int, dim: int, side: float, seed: int, outputs: int = 2) -> Poi
 
 def scales(formula: Formula, columns: Points) -> float:
     """The sum of absolute momenta, times the number of terms that a result adds up."""
-    terms = 1.0 if type(formula) is Field else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
+    terms = 1.0 if formula is FIELD else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
     return terms * len(columns.features)
 
 
@@ -60,7 +60,7 @@ def test_three_dimensions(formula: Formula) -> None:
     rows, columns = cloud(60, 3, 1.0, 1, 3), cloud(50, 3, 1.0, 2, 3)
     waves = fourier.Lattice.of(GaussianProfile(), columns.features.new_ones(3), 1e-7)
     assert waves is not None
-    found = fourier.RESULTS[type(formula)](waves, rows, columns)
+    found = fourier.RESULTS[formula](waves, rows, columns)
     assert_same(found, backends.evaluate(formula, GaussianProfile(), rows, columns, backend="dense"), 1e-6)
 
 

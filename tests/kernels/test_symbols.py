@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from sum_bank import COLUMNS, ROWS, apart, assert_same, every_formula, every_pro
 
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
 from diffeo_calib.kernels.reductions import tiled
-from diffeo_calib.kernels.reductions.formulas import Dense, Formula, Gradient, matrices
+from diffeo_calib.kernels.reductions.formulas import GRADIENT, Dense, Formula, matrices
 from diffeo_calib.kernels.reductions.fused import Fused
 from diffeo_calib.kernels.reductions.symbols import recorded
 from diffeo_calib.kernels.reductions.tiled import Tiled
@@ -45,21 +46,21 @@ OPERATIONS: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-class Operation(Gradient):
+def formulated(function: Callable[[Any, Any], Any]) -> Formula:
     """A field whose weight is any function of r2 and s, and the gradient's."""
 
-    def __init__(self, function: Callable[[Any, Any], Any]) -> None:
-        self.function = function
+    def weigh(leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
+        # the last summand is for matrices, where a constant is no matrix
+        return [function(leaf("r2"), leaf("s")) + 0.0 * leaf("s"), GRADIENT.weigh(leaf, profile)[1]]
 
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        return [self.function(leaf("r2"), leaf("s")), super().weights(leaf, profile)[1]]
+    return replace(GRADIENT, weigh=weigh)
 
 
 @pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS.keys())
 @pytest.mark.parametrize("backend", [Tiled(), Tiled(6), pytest.param(Fused(), marks=needs_llvmlite)])
 def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], backend: Any) -> None:
     i, j = apart()
-    formula = Operation(lambda x, y: operation(x, y) + 0.0 * x)  # also in matrices, where r2 may be -1e-16
+    formula = formulated(operation)
     assert recorded(formula, GaussianProfile()) is not None
     found = backend.reduce(formula, GaussianProfile(), i, j)
     assert_same(found, Dense().reduce(formula, GaussianProfile(), i, j), 1e-11)
@@ -75,7 +76,7 @@ def test_buffers_are_recycled_and_weights_hold_until_the_next_tile(formula: Form
     made: set[int] = set()
     for k in range(3):
         found, scales = tiled._recycled(weights, elements, i, j)
-        expected = formula.weights(matrices(i, j), profile)
+        expected = formula.weigh(matrices(i, j), profile)
         assert_same([w * c for w, c in zip(found, scales, strict=True)], expected, 1e-12)
         free = tiled.BUFFERS.free[elements, torch.float64, i.features.device]
         now = {b.data_ptr() for b in (*free, *found)}

@@ -1,9 +1,9 @@
-"""The kernel sums that the package needs, each written once on pairwise symbols.
+"""The kernel sums that the package needs, each written once on the scalars of a pair of points.
 
 Every result of a formula is a sum of terms  sum_j w_ij b_j  or  sum_j w_ij b_j (e_i - e_j)^T:
 
     weights   pairwise scalars w_ij, computed from squared distances and dot products by exp, sqrt and
-              arithmetic, so that the same lines run on matrices and on symbols of any kind
+              arithmetic, so that the same lines run on matrices and on symbols
     terms     which vectors b and differences of which vectors e they multiply
 
 All weights are symmetric in the points: where rows and columns are the same points, w_ij = w_ji, and a backend may
@@ -16,9 +16,9 @@ column points (and of the row points, where a formula needs them).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import reduce
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
@@ -27,6 +27,8 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
 
+Leaf = Callable[[str], Any]
+"""One of the :data:`LEAVES` by its name, as a matrix or a symbol."""
 Summand = tuple[str | None, str | None]
 """A field b of :class:`Points`, or None for 1, and one that it is multiplied by, e."""
 
@@ -65,31 +67,33 @@ class Term(NamedTuple):
     factor: float = 1.0
 
 
-class Formula(ABC):
+@dataclass(frozen=True, eq=False)
+class Formula:
     """Kernel sums; see the module's docstring.
 
-    Attributes:
+    Args:
+        name: for messages.
+        weigh: the pairwise scalars w_ij from those of :data:`LEAVES` and a profile.
         results: the terms that every result is the sum of.
         reads: the fields of :class:`Points` that it needs of the columns.
     """
 
-    results: ClassVar[tuple[tuple[Term, ...], ...]]
-    reads: ClassVar[tuple[str, ...]] = ("features", "momenta")
-
-    @abstractmethod
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        """The pairwise scalars w_ij from those of :data:`LEAVES`, as matrices or as symbols."""
+    name: str
+    weigh: Callable[[Leaf, Profile], list[Any]]
+    results: tuple[tuple[Term, ...], ...]
+    reads: tuple[str, ...] = ("features", "momenta")
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
-        return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded()]
+        return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded]
 
     def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
         """The results, from the sums (M, k) over all columns."""
         dim = i.features.shape[-1]
-        parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded(), strict=True)]
+        parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded, strict=True)]
         return tuple(reduce(torch.add, [_finished(t, parts[t.weight], i) for t in terms]) for terms in self.results)
 
+    @cached_property
     def _expanded(self) -> list[list[Summand]]:
         """The summands of every weight, without repetitions."""
         found: dict[int, dict[Summand, None]] = {}
@@ -125,68 +129,49 @@ def _finished(term: Term, parts: dict[Summand, Tensor], i: Points) -> Tensor:
     return total if term.factor == 1.0 else term.factor * total
 
 
-class Field(Formula):
-    """V_i = sum_j kappa_ij u_j: (M, r)."""
-
-    results = ((Term(0, "momenta"),),)
-
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        """kappa."""
-        return profile.derivatives(leaf("r2"), 0)
+def _gradient(leaf: Leaf, profile: Profile) -> list[Any]:
+    kappa, kappa1 = profile.derivatives(leaf("r2"), 1)
+    return [kappa, kappa1 * leaf("s")]
 
 
-class FieldAndJacobian(Formula):
-    """V (M, r) and its feature Jacobian sum_j 2 kappa'_ij u_j (E_i - F_j)^T (M, r, D)."""
-
-    results = ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),))
-
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        """kappa, kappa'."""
-        return profile.derivatives(leaf("r2"), 1)
+def _hessian_product(leaf: Leaf, profile: Profile) -> list[Any]:
+    kappa, kappa1, kappa2 = profile.derivatives(leaf("r2"), 2)
+    rho, s, ds = leaf("rho"), leaf("s"), leaf("ds")
+    return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
 
 
-class Gradient(Formula):
-    """Gradient of H = sum_ij kappa_ij u_i . u_j in the row points' (u, E): V (M, r) and (M, D).
+FIELD = Formula("field", lambda leaf, profile: profile.derivatives(leaf("r2"), 0), ((Term(0, "momenta"),),))
+"""V_i = sum_j kappa_ij u_j: (M, r)."""
+FIELD_AND_JACOBIAN = Formula(
+    "field and Jacobian",
+    lambda leaf, profile: profile.derivatives(leaf("r2"), 1),
+    ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),)),
+)
+"""V (M, r) and its feature Jacobian sum_j 2 kappa'_ij u_j (E_i - F_j)^T (M, r, D)."""
+GRADIENT = Formula("gradient", _gradient, ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),)))
+"""Gradient of H = sum_ij kappa_ij u_i . u_j in the row points' (u, E): V (M, r) and (M, D).
 
-    The second result is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points,
-    both are gradients of H / 2.
-    """
-
-    results = ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),))
-
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        """kappa, kappa' s with s = u_i . u_j."""
-        kappa, kappa1 = profile.derivatives(leaf("r2"), 1)
-        return [kappa, kappa1 * leaf("s")]
-
-
-class HessianProduct(Formula):
-    """Derivative of :class:`Gradient` along (d_momenta, d_features), and the gradient in the features.
-
-    Results: dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
-    ds = du_i . u_j + u_i . du_j:
-
-        dV_i = sum_j kappa' rho u_j + kappa du_j
-        dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)
-    """
-
-    results = (
+The second result is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points, both are
+gradients of H / 2."""
+HESSIAN_PRODUCT = Formula(
+    "Hessian product",
+    _hessian_product,
+    (
         (Term(0, "d_momenta"), Term(1, "momenta")),
         (Term(3, None, "features", 2.0), Term(2, None, "d_features", 2.0)),
         (Term(2, None, "features", 2.0),),
-    )
-    reads = Points._fields
+    ),
+    Points._fields,
+)
+"""Derivative of :data:`GRADIENT` along (d_momenta, d_features), and the gradient in the features.
 
-    def weights(self, leaf: Callable[[str], Any], profile: Profile) -> list[Any]:
-        """kappa, kappa' rho, kappa' s, kappa'' rho s + kappa' ds."""
-        kappa, kappa1, kappa2 = profile.derivatives(leaf("r2"), 2)
-        rho, s, ds = leaf("rho"), leaf("s"), leaf("ds")
-        return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
+Results: dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
+ds = du_i . u_j + u_i . du_j:
 
-
-FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian(), Gradient(), HessianProduct()
-
-
+    dV_i = sum_j kappa' rho u_j + kappa du_j
+    dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)
+    G_i  = sum_j 2 kappa' s (F_i - F_j)
+"""
 LEAVES = ("r2", "rho", "s", "ds")
 """Scalars of a pair of points that weights are made of: |E_i - F_j|^2, 2 (E_i - F_j) . (dE_i - dF_j), u_i . u_j and
 du_i . u_j + u_i . du_j."""
@@ -229,18 +214,41 @@ def weighted_sums(weights: Sequence[Tensor], summands: list[Tensor]) -> list[Ten
     return [b @ w.T for w, b in zip(weights, summands, strict=True)]
 
 
-class Dense:
-    """Evaluates all pairs at once."""
+class SumBackend:
+    """How kernel sums are evaluated.
 
-    differentiable: ClassVar[bool] = True
+    Attributes:
+        differentiable: whether autograd can differentiate the sums. Tiled sums replace a backend that cannot where
+            gradients are needed.
+    """
+
+    differentiable: ClassVar[bool] = False
 
     def usable(self) -> bool:
-        """Always."""
+        """Whether the backend is expected to work on this machine; warns once if not."""
         return True
 
+    def reduce(
+        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, M rows each; None where the backend cannot evaluate it: tiled sums replace it.
+
+        Args:
+            profile: the radial profile kappa.
+            rows: the M points at which sums are evaluated; None for the columns themselves, where the weights are
+                symmetric.
+            columns: the N points of the sum.
+        """
+        raise NotImplementedError
+
+
+class Dense(SumBackend):
+    """Evaluates all pairs at once."""
+
+    differentiable = True
+
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        """The results of a formula, M rows each; rows None for the columns themselves."""
         at = columns if rows is None else rows
-        weights = formula.weights(matrices(at, columns), profile)
+        weights = formula.weigh(matrices(at, columns), profile)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         return formula.finish([s.T for s in weighted_sums(weights, summands)], at)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache, partial, reduce
 from threading import RLock
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import SHIPPED, Profile
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.formulas import Formula, Points, SumBackend
 from diffeo_calib.kernels.reductions.keops import cache_folder, warn
 from diffeo_calib.kernels.reductions.loops import ARGUMENTS, Program, Vector
 from diffeo_calib.kernels.reductions.symbols import Weights, recorded
@@ -210,14 +210,12 @@ class Compiled(NamedTuple):
         return tuple(found)
 
 
-class Fused:
+class Fused(SumBackend):
     """Evaluates sums in compiled loops, on a CPU.
 
     Attributes:
         failed: whether LLVM has failed; it is not tried again then.
     """
-
-    differentiable: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self.failed = False
@@ -229,7 +227,6 @@ class Fused:
         return not self.failed and _reason() is None
 
     def usable(self) -> bool:
-        """Whether the backend is expected to work on this machine; warns once if not."""
         if not self.available():
             warn(f"{_reason() or 'LLVM has failed'}.")
         return self.available()
@@ -266,7 +263,6 @@ class Fused:
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
     ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, or None where it is not for this backend; not differentiable by autograd."""
         compiled = self.program(formula, profile, rows, columns)
         if compiled is None:
             return None

@@ -20,14 +20,14 @@ from collections.abc import Callable, Sequence
 from functools import cache, reduce
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError, sentence
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula, Points, factors
+from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula, Points, SumBackend, factors
 from diffeo_calib.kernels.reductions.symbols import Weights, recorded
 
 CXXFLAGS = (
@@ -77,30 +77,23 @@ def _lazy(weights: Weights, keops: ModuleType, i: Points, j: Points) -> list[Any
     return [found[node] for node, _ in weights.results]
 
 
-class Keops:
+class Keops(SumBackend):
     """Fused lazy sums.
 
     Attributes:
         failed: whether a compilation or a run has failed; KeOps is not tried again then.
     """
 
-    differentiable: ClassVar[bool] = False
-
     def __init__(self) -> None:
         self.failed = False
 
     def usable(self) -> bool:
-        """Whether KeOps is expected to work; warns once if not."""
         return not self.failed and available()
 
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
     ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, M rows each, as :meth:`SumBackend.reduce`; not differentiable by autograd.
-
-        Raises:
-            KeopsUnavailableError: compiling or running the formula failed.
-        """
+        """As :meth:`SumBackend.reduce`; KeopsUnavailableError if compiling or running the formula failed."""
         rows, weights = columns if rows is None else rows, recorded(formula, profile)
         if weights is None:
             return None

@@ -181,7 +181,7 @@ def _recorded(formula: Formula, profile: Profile) -> Weights | None:
     nodes: dict[Node, int] = {}
     leaves = {name: Symbol(nodes, nodes.setdefault(Node(name), len(nodes))) for name in LEAVES}
     try:
-        results = tuple((weight.node, weight.scale) for weight in formula.weights(leaves.__getitem__, profile))
+        results = tuple((weight.node, weight.scale) for weight in formula.weigh(leaves.__getitem__, profile))
     except Exception:  # a profile of the user may raise anything where it gets symbols, and works with tensors
         return None
     return Weights(tuple(nodes), results)

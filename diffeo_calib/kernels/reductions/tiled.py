@@ -22,7 +22,15 @@ from torch import Tensor
 
 from diffeo_calib.common.threads import in_parallel, small_work
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula, Points, factors, matrices, weighted_sums
+from diffeo_calib.kernels.reductions.formulas import (
+    LEAVES,
+    Formula,
+    Points,
+    SumBackend,
+    factors,
+    matrices,
+    weighted_sums,
+)
 from diffeo_calib.kernels.reductions.symbols import Weights, recorded
 
 CPU_ELEMENTS = 1 << 18
@@ -48,7 +56,7 @@ Chosen = Callable[[Sequence[Any]], list[Any]]
 
 
 @dataclass(frozen=True)
-class Tiled:
+class Tiled(SumBackend):
     """Evaluates one tile after the other.
 
     Args:
@@ -58,16 +66,9 @@ class Tiled:
     elements: int | None = None
     differentiable: ClassVar[bool] = True
 
-    def usable(self) -> bool:
-        """Always."""
-        return True
-
     @small_work()
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        """The results of a formula, M rows each; rows None for the columns themselves.
-
-        Differentiable by autograd, which stores all tiles.
-        """
+        """As :meth:`SumBackend.reduce`. Differentiable by autograd, which stores all tiles."""
         at = columns if rows is None else rows
         if torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors):
             summands = [b.T.contiguous() for b in formula.summands(columns)]
@@ -181,7 +182,7 @@ def _slices(count: int, size: int) -> list[slice]:
 
 def _plain(formula: Formula, profile: Profile, i: Points, j: Points) -> tuple[list[Tensor], list[float]]:
     """Weights by operations of tensors: what autograd follows, and any profile of a user."""
-    weights = formula.weights(matrices(i, j), profile)
+    weights = formula.weigh(matrices(i, j), profile)
     return weights, [1.0] * len(weights)
 
 
