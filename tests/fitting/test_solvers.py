@@ -1,7 +1,6 @@
 """Solvers of the exact model: Gauss-Newton and L-BFGS find the same optimum, and report how they stopped."""
 
 from contextlib import suppress
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -70,12 +69,6 @@ def test_step_error_is_an_error_of_the_end_points(small: Fit) -> None:
     exact = small.problem.deform(small.momenta, dc.RK4(32)).z1
     error = float((small.model.deformation.z1 - exact).abs().max())
     assert small.step_error == pytest.approx(error, rel=5e-3)
-
-
-def test_history_never_rises_beyond_the_flatness(small: Fit) -> None:
-    for before, after in pairwise(small.history):
-        assert after <= before * (1 + 1e-6)
-    assert small.history[-1] < 1e-2 * small.history[0]
 
 
 def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
@@ -161,13 +154,6 @@ def test_interruption_keeps_the_best_state(solver: dc.GaussNewton | dc.LBFGS, ca
     assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
     assert fit.iterations == call * (5 if isinstance(solver, dc.LBFGS) else 1)
     torch.testing.assert_close(fit.model(problem.x), fit.model.deformation.z1, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("solver", [dc.GaussNewton(max_iterations=2), dc.LBFGS(max_iterations=5, tolerance=0.0)])
-def test_limit_of_iterations_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
-    fit = dc.fit(rr_problem(3, noise=0.1), solver, dc.RK4(1))
-    assert "raise `max_iterations`" in fit.status
-    assert not fit.converged
 
 
 @pytest.mark.slow

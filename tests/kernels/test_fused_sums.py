@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 import threading
@@ -16,13 +15,12 @@ from typing import Any
 import pytest
 import torch
 from math_bank import normal, torch_threads
-from sum_bank import Formulated, assert_same, every_formula, every_profile, mapped, points
+from sum_bank import Formulated, assert_same, every_formula, every_profile, points
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.reductions import backends, keops
 from diffeo_calib.kernels.reductions import fused as sums
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
@@ -83,13 +81,6 @@ def test_shares_of_processes_add_up() -> None:
         torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)
 
 
-def test_points_of_other_types_go_elsewhere() -> None:
-    j = points(40, 2)
-    for other in (j._replace(momenta=j.momenta.float()), mapped(j, Tensor.float)):
-        assert Fused().reduce(FIELD, GaussianProfile(), None, other) is None
-    assert Fused().reduce(FIELD, GaussianProfile(), mapped(j, Tensor.float), j) is None
-
-
 # --- The exponential ---------------------------------------------------------------------------------------------
 
 
@@ -145,25 +136,6 @@ class Decorated(Own):
 
     def derivative(self, r2: Any, order: int) -> Any:
         return super().derivative(r2, order) * torch.cos(r2 * 0.0)
-
-
-def test_a_profile_of_the_user() -> None:
-    j = points(50, 2)
-    for alpha in (0.4, 0.9, torch.tensor(0.3, dtype=torch.float64)):
-        profile = Own(alpha)
-        assert_same(fused(FULL, profile, None, j), Dense().reduce(FULL, profile, None, j), 1e-11)
-    kernel = RadialKernel(Own(0.2), lengthscale=0.7)
-    q, a = normal(40, 3, seed=1), normal(40, 3, seed=2)
-    assert_same([kernel.using("fused").field(None, q, a)], [kernel.using("dense").field(None, q, a)], 1e-12)
-
-
-def test_a_changed_parameter_is_noticed() -> None:
-    backend, profile, j = Fused(), Own(0.4), points(30, 2)
-    for alpha in (0.4, 0.8):
-        profile.alpha = alpha
-        found = backend.reduce(FIELD, profile, None, j)
-        assert found is not None
-        assert_same(found, Dense().reduce(FIELD, profile, None, j), 1e-12)
 
 
 def test_a_number_from_elsewhere_is_noticed_when_it_changes() -> None:
@@ -236,19 +208,6 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
         sums._reason.cache_clear()
-
-
-def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor would a full disk become fuller with every process."""
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(os, "replace", full)
-    monkeypatch.setattr(sums, "machine", cache(sums.Machine))
-    fused(FIELD, GaussianProfile(), None, points(30, 2))
-    assert list((tmp_path / "diffeo_calib" / "fused").iterdir()) == []
 
 
 def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ from math_bank import (
     MIXED,
     NAMES,
     Case,
-    central_difference,
     circle,
     constant_kernel,
     normal,
@@ -118,17 +117,6 @@ def test_field_and_its_jacobian(case: Case) -> None:
 
 
 @every_case
-def test_jacobian_at_the_controls_themselves(case: Case) -> None:
-    """A control does not contribute to the Jacobian at itself: the kernel is flat at distance 0."""
-    _, q, a = data(case)
-    _, dv = case.kernel.field_and_jacobian(None, q, a)
-    for i in range(N):
-        others = [j for j in range(N) if j != i]
-        expected = rows_jacobian(lambda at, rest=others: case.velocity(at, q[rest], a[rest]), q[i : i + 1])
-        torch.testing.assert_close(dv[i : i + 1], expected, rtol=1e-12, atol=1e-12)
-
-
-@every_case
 def test_gradient_of_the_hamiltonian(case: Case) -> None:
     _, q, a = data(case)
     live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
@@ -162,15 +150,6 @@ def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
     dv, dg = case.kernel.hessian_product(q, a, dq, da)
     torch.testing.assert_close(dv, expected_a, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(dg, expected_q, rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
-    _, q, a = data(case)
-    both, d_both = torch.stack([q, a]), normal(2, N, case.dim, seed=6)
-    expected = central_difference(lambda at: torch.stack(case.kernel.hamiltonian_gradient(at[0], at[1])), both, d_both)
-    actual = torch.stack(case.kernel.hessian_product(q, a, d_both[0], d_both[1]))
-    torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
 
 
 @every_case
@@ -220,17 +199,6 @@ def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) ->
     left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
     scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, v: build(s, v).gram(x, left, x, right), (scales, variance), atol=1e-7)
-
-
-def test_scalar_hyper_parameter_gradients() -> None:
-    x, left = uniform(4, 3, seed=1), normal(4, 2, 3, seed=3)
-    scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
-
-    def gram(s: Tensor, v: Tensor) -> Tensor:
-        kernel = RadialKernel(GaussianProfile(), lengthscale=s, variance=v, columns=[0, 2], output=1)
-        return kernel.gram(x, left, x, left)
-
-    assert torch.autograd.gradcheck(gram, (scale, variance), atol=1e-7)
 
 
 def test_sums_are_flat_and_add() -> None:

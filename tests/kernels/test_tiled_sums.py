@@ -102,19 +102,6 @@ def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
     assert_same(found[0], expected, 1e-9)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(3, 5000), (5000, 3), (500, 700), (1, 1)])
-def test_rectangular_tiles_cover_everything_within_their_size(
-    rows: int, columns: int, tiles: list[tuple[int, int]]
-) -> None:
-    elements = 1000
-    i, j = points(rows, 1), points(columns, 2)
-    assert_same(
-        Tiled(elements).reduce(FIELD, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-12
-    )
-    assert max(m * n for m, n in tiles) <= elements
-    assert sum(m * n for m, n in tiles) == rows * columns
-
-
 # --- Differentiation --------------------------------------------------------------------------------------------
 
 
@@ -157,14 +144,3 @@ def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
     live = [t.clone().requires_grad_() for t in (i, j, points(COLUMNS, 20).momenta)]
     assert torch.autograd.gradcheck(gradient, live)
     assert torch.autograd.gradgradcheck(gradient, live)
-
-
-@every_formula
-def test_without_gradients_nothing_is_recorded(formula: Formula) -> None:
-    i, j = apart()
-    expected = backends.evaluate(formula, GaussianProfile(), i, j)
-    live = mapped(i, lambda t: t.clone().requires_grad_())
-    with torch.no_grad():
-        results = backends.evaluate(formula, GaussianProfile(), live, j, "tiled")
-    assert_same(results, expected)
-    assert not any(t.requires_grad for t in results)

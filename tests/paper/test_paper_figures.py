@@ -10,14 +10,10 @@ import pytest
 import torch
 from image_bank import png_size
 from paper_figures import (
-    POSES,
     heat_maps_figure,
     histogram_figure,
     main,
     paper_figures,
-    poses_figure,
-    surfaces_figure,
-    workspaces_figure,
 )
 from rr_bed import held_out
 from torch import Tensor
@@ -42,55 +38,6 @@ def log_errors() -> np.ndarray:
 def curve(line: Any) -> np.ndarray:
     """(N, 2)"""
     return np.stack([line.get_xdata(), line.get_ydata()], 1)
-
-
-def test_random_configurations_cover_the_torus() -> None:
-    x = held_out()
-    assert x.shape == (3000, 2)
-    assert 3.1 < float(x.abs().max()) <= torch.pi
-    assert torch.equal(x, held_out())
-
-
-def test_poses_show_both_arms() -> None:
-    (axes,) = poses_figure().axes
-    x = torch.tensor(POSES, dtype=torch.float64)
-    drawn = [curve(line) for line in axes.lines]
-    rigid = [line for line in drawn if len(line) == 3 and not line[0].any()]
-    np.testing.assert_allclose(np.stack([line[-1] for line in rigid]), elastic_rr.nominal(x), atol=1e-12)
-    np.testing.assert_allclose([np.linalg.norm(np.diff(line, axis=0), axis=1) for line in rigid], [[1.0, 0.5]] * 5)
-    bent = [line for line in drawn if len(line) > 3]
-    np.testing.assert_allclose(np.stack(bent), elastic_rr.real_links(x).flatten(1, 2), atol=1e-12)
-    legend = axes.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["nominal", "real"]
-
-
-def test_surfaces_are_coloured_by_the_errors() -> None:
-    """Four panels and two colour bars, whose limits are a million times smaller for the model."""
-    drawn = surfaces_figure(model).axes
-    surfaces, (nominal, calibrated) = [a for a in drawn if a.get_title()], [a for a in drawn if not a.get_title()]
-    names = ("nominal (figure 6)", "calibrated (figure 7)")
-    assert [a.get_title() for a in surfaces] == [f"{name}, $y_{k}$" for name in names for k in (1, 2)]
-    assert nominal.get_ylabel() == calibrated.get_ylabel() == "log10 of the |error| / length unit"
-    top = np.array([bar.get_ylim()[1] for bar in (nominal, calibrated)])
-    assert top[0] - top[1] == pytest.approx(6.0, abs=1e-3)
-    side = torch.linspace(-torch.pi, torch.pi, 61, dtype=torch.float64)
-    x = torch.cartesian_prod(side, side)
-    largest = float((elastic_rr.nominal(x) - elastic_rr.real(x)).abs().max().log10())
-    assert top[0] == pytest.approx(largest, abs=1e-9)
-
-
-def test_workspaces_are_images_of_one_grid() -> None:
-    for axes, (name, distance) in zip(
-        workspaces_figure(model).axes, (("nominal (figure 8)", 0.3), ("calibrated (figure 9)", GAIN)), strict=True
-    ):
-        assert axes.get_title() == name
-        curves = [curve(line) for line in axes.lines if len(np.atleast_1d(line.get_xdata()))]
-        half = len(curves) // 2
-        assert half == 13 + 24
-        gaps = [np.abs(a - b).max() for a, b in zip(curves[:half], curves[half:], strict=True)]
-        assert max(gaps) < distance
-        assert max(np.linalg.norm(points, axis=1).max() for points in curves) < 1.6  # the reach is 1.5
 
 
 def test_heat_maps_show_every_error_where_the_tip_is() -> None:

@@ -75,13 +75,6 @@ def test_product_with_parameters(problem: Problem) -> None:
     torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
 
 
-@every_problem
-def test_linearisation_of_some_rows(problem: Problem) -> None:
-    lin, rows, m = deformed(problem).linearise(), torch.tensor([3, 1, 7]), problem.y.shape[1]
-    index = (rows[:, None] * m + torch.arange(m)).flatten()
-    torch.testing.assert_close(lin.rows(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
-
-
 @pytest.mark.slow
 @every_way
 @every_problem
