@@ -31,14 +31,11 @@ Formulation = Literal["exact", "eulerian"]
 
 MAX_STEP_ERROR_RATIO = 0.01
 """Largest accepted time-stepping error, as a fraction of the noise, when time steps are chosen."""
-FINEST_INTEGRATOR = RK8(8)
-"""The finest time stepping that is chosen."""
+FINEST_INTEGRATOR = RK8(8)  # the finest time stepping that is chosen
 MAX_EXCESS_FOR_TWO_STEPS = 8.0
 """Largest error of one RK4 step, relative to the accepted one, at which two steps (16 times less error) are tried."""
-TRIAL_ITERATIONS = 4
-"""Iterations of Gauss-Newton after which the momenta are accurate enough to choose the time steps."""
-COARSE_START_INTEGRATOR = RK4(2)
-"""Time stepping of the fit that starts a coarse model."""
+TRIAL_ITERATIONS = 4  # iterations of Gauss-Newton after which the momenta are accurate enough to choose the time steps
+COARSE_START_INTEGRATOR = RK4(2)  # time stepping of the fit that starts a coarse model
 
 
 class Solver(Protocol):
@@ -250,8 +247,7 @@ def _enough_steps(
     return integrator.refined() if isinstance(integrator, RK8) else RK8(1), run
 
 
-MOST_HALVINGS = 6
-"""Of the way from the start of a fit to momenta whose flows overflow with finer time steps."""
+MOST_HALVINGS = 6  # of the way from the start of a fit to momenta whose flows overflow with finer time steps
 SAMPLE_COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where these are many: in the choice of control
 points, and in the fit that starts the fit of all rows."""

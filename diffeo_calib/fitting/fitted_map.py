@@ -27,8 +27,7 @@ from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegress
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
-PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100
-"""Number of configurations that are linearised together for their covariances."""
+PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
 OPEN_TURN_RAD = 1.0
 """Prior standard deviation from which a turn of all points is open: between that of a base that was found, 0.1, which a
 changed robot widens by up to ten, and that of an open one, 2."""

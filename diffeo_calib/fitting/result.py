@@ -59,8 +59,7 @@ NEGLIGIBLE_ENERGY = 1e-12
 """Energy per measured coordinate below which k0 fits the data up to rounding, so that residuals are meaningless."""
 UNFINISHED_COUPLING_RESIDUAL = 0.01
 """Coupling residual above which a descent has not reached the optimum (time steps hardly change this residual)."""
-MAX_END_RESIDUAL = 0.05
-"""Largest violation of the end condition (12) of a converged fit."""
+MAX_END_RESIDUAL = 0.05  # largest violation of the end condition (12) of a converged fit
 
 
 def silent(task: str, done: int, total: int) -> None:

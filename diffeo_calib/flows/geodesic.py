@@ -125,8 +125,7 @@ class _Energy(torch.autograd.Function):
         return grads[0] * gradient, grads[0] * velocity, None
 
 
-BLOCK_ROWS = 4096
-"""Number of points that are evaluated together, which bounds the memory of large queries."""
+BLOCK_ROWS = 4096  # number of points that are evaluated together, which bounds the memory of large queries
 
 
 class Flow:

@@ -114,8 +114,7 @@ def integrate_alongside(
     return [node[size:].view_as(start) for node in nodes]
 
 
-_TENSORS: dict[str, tuple[Tensor, Tensor]] = {}
-"""Tableaus that were used, by the kinds of their methods."""
+_TENSORS: dict[str, tuple[Tensor, Tensor]] = {}  # tableaus that were used, by the kinds of their methods
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 
-PROBE_POINTS = 3
-"""Number of points at which the default check evaluates a kernel's matrix."""
+PROBE_POINTS = 3  # number of points at which the default check evaluates a kernel's matrix
 ROUNDING_RATIO = 1e-8
 """Asymmetry and negative eigenvalues of a kernel matrix, relative to its largest entry, that count as rounding."""
 

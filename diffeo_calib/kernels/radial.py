@@ -41,8 +41,7 @@ from diffeo_calib.kernels.reductions.formulas import (
 )
 from diffeo_calib.kernels.spaces import FeatureMap, Space
 
-PROBE = "profile_probe"
-"""Entry of a kernel whose profile is a user's: its values, see :func:`probe`."""
+PROBE = "profile_probe"  # entry of a kernel whose profile is a user's: its values, see :func:`probe`
 
 
 class RadialKernel(Kernel):

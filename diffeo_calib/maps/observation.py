@@ -26,8 +26,7 @@ from diffeo_calib.maps.noise import Noise
 O = TypeVar("O", bound="Observation")  # noqa: E741
 SMALLEST_DISTANCE_M = 1e-6
 """Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
-UNSEEN_SHARE = 1e-6
-"""Information about coordinates that no row sees, relative to the mean of all coordinates."""
+UNSEEN_SHARE = 1e-6  # information about coordinates that no row sees, relative to the mean of all coordinates
 
 
 class Observation(ABC):

@@ -289,10 +289,8 @@ def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
     return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
 
 
-MAX_SHOTS = 20
-"""Largest number of shooting steps; few suffice where shooting converges."""
-SHORTEST_SHOT = 0.5
-"""Smallest fraction of a shooting step that is tried."""
+MAX_SHOTS = 20  # largest number of shooting steps; few suffice where shooting converges
+SHORTEST_SHOT = 0.5  # smallest fraction of a shooting step that is tried
 
 
 class EulerianProblem(Objective[EulerianDeformation]):

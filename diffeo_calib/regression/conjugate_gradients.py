@@ -21,21 +21,15 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, Features, of_parameters
 
-BLOCK_CONFIGURATIONS = 64
-"""Number of configurations that are drawn together."""
+BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
 NEGLIGIBLE_VARIANCE_RATIO = 0.03
 """Mean unexplained variance, relative to the noise's, at which the factor is accurate enough."""
-ROUNDING_EIGENVALUE_RATIO = 1e-11
-"""Eigenvalues of a block below this fraction of the largest one are rounding errors."""
-MAX_RANK = 3000
-"""Largest rank of the preconditioner."""
-MAX_EXACT_COORDINATES = 8000
-"""Largest number of measured coordinates for which covariances are computed by iteration."""
-CG_TOLERANCE = 1e-11
-"""Default tolerance of the relative residual."""
+ROUNDING_EIGENVALUE_RATIO = 1e-11  # eigenvalues of a block below this fraction of the largest one are rounding errors
+MAX_RANK = 3000  # largest rank of the preconditioner
+MAX_EXACT_COORDINATES = 8000  # largest number of measured coordinates for which covariances are computed by iteration
+CG_TOLERANCE = 1e-11  # default tolerance of the relative residual
 MAX_ITERATIONS = 300
-ACCEPTABLE_RESIDUAL = 1e-6
-"""Relative residual that is accepted where rounding keeps it above the tolerance."""
+ACCEPTABLE_RESIDUAL = 1e-6  # relative residual that is accepted where rounding keeps it above the tolerance
 
 
 def partial_cholesky(linearisation: Linearisation, max_rest: float, rank: int, seed: int = 0) -> tuple[Tensor, Tensor]:

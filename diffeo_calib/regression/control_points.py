@@ -38,8 +38,7 @@ from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Featu
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
-BLOCK_ENTRIES = 1 << 22
-"""Number of entries of A that are computed together (32 MiB)."""
+BLOCK_ENTRIES = 1 << 22  # number of entries of A that are computed together (32 MiB)
 SHARED_ENTRIES = 1 << 24
 """Number of entries of A from which several processes share its blocks: with fewer, some would have nothing to do."""
 STRIPS = 8
@@ -69,11 +68,9 @@ class ControlPointRegression(Conditional):
         self.spec: ModelSpec = deformation.spec
         self.deformation, self.like = deformation, deformation.momenta
         self.x, self.noise, self.slopes = x, noise, slopes
-        self.joint, self.task = deformation.momentum_sensitivities()
-        self._roots = [
-            _root(kernel, nodes)
-            for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
-        ]
+        self.controls = deformation.momentum_sensitivities()
+        kernels = self.spec.joint_kernel, self.spec.task_kernel
+        self._roots = [_root(kernel, nodes) for kernel, nodes in zip(kernels, self.controls, strict=True)]
         self._shifts = noise.shared.shape[2]
         self.size = size = sum(t.numel() for t in self.like.tensors) + self._shifts
         large = len(x) * size * noise.covariance.shape[1] >= SHARED_ENTRIES
@@ -163,10 +160,7 @@ class ControlPointRegression(Conditional):
     def _rows(self, at: Linearisation) -> Tensor:
         """Rows of A for the configurations of a linearisation: (M m, size)."""
         columns = []
-        for kernel, points, controls in (
-            (self.spec.joint_kernel, at.joint, self.joint),
-            (self.spec.task_kernel, at.task, self.task),
-        ):
+        for (kernel, points), controls in zip(at.sides, self.controls, strict=True):
             terms = [
                 kernel.gram(c.points, c.effect, a.points, a.weight * a.effect).T
                 for a, c in zip(points, controls, strict=True)

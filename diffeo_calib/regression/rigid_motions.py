@@ -19,8 +19,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.regression.conditional import Conditional, Features
 
-ROWS_AT_ONCE = 64
-"""Configurations whose covariances with the reference are computed together."""
+ROWS_AT_ONCE = 64  # configurations whose covariances with the reference are computed together
 
 
 class WithoutRigidMotions(Conditional):

@@ -67,7 +67,7 @@ def test_erratum_1_printed_sign_is_slow(bed: dc.Problem, corrected: dc.Fit) -> N
     fit = dc.fit(bed, solver, dc.RK4(2), formulation="eulerian", printed_sign=True)
     assert not fit.converged
     assert fit.energy > 2 * corrected.energy
-    assert EulerianProblem(bed, Eulerian(printed_sign=True)).start(dc.RK4(2)).momenta.task.count_nonzero() == 0
+    assert EulerianProblem(bed, Eulerian(printed_sign=True)).start(dc.RK4(2))[0].task.count_nonzero() == 0
     for equations, lowers in ((Eulerian(printed_sign=True), False), (Eulerian(), True)):
         problem = EulerianProblem(bed, equations)
         start = tangent(bed).momenta().task

@@ -39,14 +39,10 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
-FINEST_ACCURACY = 1e-12
-"""Below it rounding counts."""
-FALLBACK = "tiled"
-"""The backend that works everywhere, for any number of points."""
-FUSED_PAIRS = 1 << 8
-"""Smallest number of pairs for which `auto` uses compiled loops."""
-DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Largest number of pairs for which `auto` materialises the matrix."""
+FINEST_ACCURACY = 1e-12  # below it rounding counts
+FALLBACK = "tiled"  # the backend that works everywhere, for any number of points
+FUSED_PAIRS = 1 << 8  # smallest number of pairs for which `auto` uses compiled loops
+DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}  # largest number of pairs for which `auto` materialises the matrix
 KEOPS_PAIRS = 1 << 22
 """Smallest number of pairs for which `auto` uses KeOps on a GPU. On a CPU tiled sums, which visit each pair once, take
 less time at every size."""

@@ -37,8 +37,7 @@ SMALLEST_SHARED_PAIRS = 1 << 26
 Compiled loops take 15 ms for so many on one thread."""
 PATIENCE_SECONDS = 300.0
 """How long a rank waits for others that are alive but late. A rank that has ended is noticed at once."""
-AGREEMENT = 1e-9
-"""Relative difference between summaries of the ranks' data that counts as rounding."""
+AGREEMENT = 1e-9  # relative difference between summaries of the ranks' data that counts as rounding
 
 
 class LostRankError(DiffeoCalibError):

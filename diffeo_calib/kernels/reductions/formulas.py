@@ -27,8 +27,7 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
 
-Leaf = Callable[[str], Any]
-"""One of the :data:`LEAVES` by its name, as a matrix or a symbol."""
+Leaf = Callable[[str], Any]  # one of the :data:`LEAVES` by its name, as a matrix or a symbol
 Summand = tuple[str | None, str | None]
 """A field b of :class:`Points`, or None for 1, and one that it is multiplied by, e."""
 

@@ -36,20 +36,13 @@ from diffeo_calib.kernels.reductions.formulas import (
     Points,
 )
 
-MOST_WAVES = 1 << 16
-"""Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""
-WAVE_COST = 0.5
-"""Time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)."""
-POINT_COST = 150.0
-"""Time of a point beside its waves, relative to that of a pair."""
-WAVES_TIMES_POINTS_AT_ONCE = 1 << 20
-"""Waves times points in memory at once."""
-CHECKED_ROWS = 24
-"""Rows and columns at which every lattice is checked."""
-DERIVATIVES = 2
-"""The highest derivative of the kernel in a formula."""
-STEPS, FARTHEST = 4096, 60.0
-"""Distances and frequencies that are looked at."""
+MOST_WAVES = 1 << 16  # largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes
+WAVE_COST = 0.5  # time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)
+POINT_COST = 150.0  # time of a point beside its waves, relative to that of a pair
+WAVES_TIMES_POINTS_AT_ONCE = 1 << 20  # waves times points in memory at once
+CHECKED_ROWS = 24  # rows and columns at which every lattice is checked
+DERIVATIVES = 2  # the highest derivative of the kernel in a formula
+STEPS, FARTHEST = 4096, 60.0  # distances and frequencies that are looked at
 
 
 @lru_cache(maxsize=256)

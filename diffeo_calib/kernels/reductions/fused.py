@@ -118,16 +118,11 @@ def _kept(mark: str) -> bytes | None:
     return code if hashlib.sha256(code).digest() == digest else None
 
 
-TILE_BYTES = 20 << 10
-"""Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
-CACHE_LINE = 64
-"""Bytes."""
-MOST_GROUP = 16
-"""Largest number of points that a program processes together."""
-MOST_OUTPUTS = 96
-"""Sums per row beyond which products of matrices take less time."""
-MOST_INPUTS = 64
-"""Numbers of a point beyond which compiling takes seconds, and products of matrices take less time."""
+TILE_BYTES = 20 << 10  # inputs and sums of the columns of a tile: they stay in the first cache of any processor
+CACHE_LINE = 64  # bytes
+MOST_GROUP = 16  # largest number of points that a program processes together
+MOST_OUTPUTS = 96  # sums per row beyond which products of matrices take less time
+MOST_INPUTS = 64  # numbers of a point beyond which compiling takes seconds, and products of matrices take less time
 MOST_VARIANTS = 64
 """Sums with profiles of one class of the user's that are compiled. With more, a parameter is being optimised, and
 compiling takes too long."""
@@ -270,8 +265,7 @@ class Fused(SumBackend):
         return compiled.results(compiled.totals(rows, columns), len(at.features))
 
 
-FUSED = Fused()
-"""One for the whole program, which keeps what it has compiled."""
+FUSED = Fused()  # one for the whole program, which keeps what it has compiled
 
 
 @cache

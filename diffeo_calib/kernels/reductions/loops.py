@@ -23,8 +23,7 @@ from diffeo_calib.kernels.reductions.symbols import Weights
 
 ROWS = ((4, 8), (12, 4), (32, 2))
 """Sums of a row, and the number of rows of a block up to it; beyond it one row. Measured with 16 and 32 registers."""
-ARGUMENTS = 10
-"""Of the function of a program."""
+ARGUMENTS = 10  # of the function of a program
 EXP2 = (
     1.0,
     0.6931471805599516,
@@ -39,8 +38,7 @@ EXP2 = (
     7.111758687557852e-09,
 )
 """Coefficients of 2^f for |f| <= 1/2, the best ones for the largest relative error: 3e-16."""
-BIAS, FRACTION_BITS = 1023, 52
-"""Of a double."""
+BIAS, FRACTION_BITS = 1023, 52  # of a double
 
 
 @dataclass(frozen=True)
@@ -94,6 +92,11 @@ class Code:
         """a b + c."""
         v = self.vector
         return self.value(f"call {v} @llvm.fmuladd.{v.suffix}({v} {a}, {v} {b}, {v} {c})")
+
+    def root(self, x: str) -> str:
+        """The square root."""
+        v = self.vector
+        return self.value(f"call {v} @llvm.sqrt.{v.suffix}({v} {x})")
 
     def bounded(self, x: str, limit: str, side: str) -> str:
         """The limit where x is below ("olt") or above ("ogt") it; NaN stays NaN."""
@@ -149,7 +152,7 @@ class Program:
         sizes = {None: 1, **self.sizes}
         return [sizes[terms[0].vector] * sizes[terms[0].apart] for terms in self.formula.results]
 
-    @cached_property
+    @property
     def count(self) -> int:
         """Sums of a row."""
         return sum(self.outputs)
@@ -159,7 +162,7 @@ class Program:
         """Of a block."""
         return next((rows for outputs, rows in ROWS if self.count <= outputs), 1)
 
-    @cached_property
+    @property
     def group(self) -> int:
         """Points that are processed together; their number is a multiple of it."""
         return max(self.vector.lanes, self.rows)
@@ -173,6 +176,19 @@ class Program:
         return text, [result.factor for result in plain.results]
 
 
+OPERATIONS: dict[str, Callable[..., str]] = {
+    "product": lambda code, a, b, _: code.call("fmul", a, b),
+    "ratio": lambda code, a, b, _: code.call("fdiv", a, b),
+    "sum": lambda code, a, b, c: code.fused(b, code.constant(c), a),
+    "shift": lambda code, a, c: code.call("fadd", a, code.constant(c)),
+    "scale": lambda code, a, c: code.call("fmul", a, code.constant(c)),
+    "inverse": lambda code, a, _: code.call("fdiv", code.constant(1.0), a),
+    "sqrt": lambda code, a, _: code.root(a),
+    "relu": lambda code, a, _: code.bounded(a, code.constant(0.0), "olt"),
+}
+"""Operations of :class:`Node` as instructions, but for the exponential."""
+
+
 class _Lowering:
     """Weights of a row and a vector of columns, as instructions.
 
@@ -181,31 +197,19 @@ class _Lowering:
     """
 
     def __init__(self, code: Code, weights: Weights, i: Points, j: Points) -> None:
-        self.code, self.i, self.j, self.known, v = code, i, j, {}, code.vector
+        self.code, self.i, self.j = code, i, j
+        known: dict[int, str] = {}
         for k, (name, operands, number) in weights.steps():
-            a, *b = (self.known[o] for o in operands) if operands else ("",)
+            values = [known[o] for o in operands]
             if name in LEAVES:
-                found = self._leaf(name)
-            elif name == "relu" and weights.nodes[operands[0]].name == "r2":
-                found = a  # a sum of squares here
-            elif name in ("product", "ratio"):
-                found = code.call("fmul" if name == "product" else "fdiv", a, b[0])
-            elif name == "sum" and abs(number) == 1.0:
-                found = code.call("fadd" if number > 0.0 else "fsub", a, b[0])
-            elif name == "sum":
-                found = code.fused(b[0], code.constant(number), a)
-            elif name in ("shift", "scale"):
-                found = code.call("fadd" if name == "shift" else "fmul", a, code.constant(number))
-            elif name == "inverse":
-                found = code.call("fdiv", code.constant(1.0), a)
+                known[k] = self._leaf(name)
             elif name == "exp":
-                found = code.exp(a, number, weights.positive[operands[0]])
-            elif name == "sqrt":
-                found = code.value(f"call {v} @llvm.sqrt.{v.suffix}({v} {a})")
+                known[k] = code.exp(*values, number, weights.positive[operands[0]])
+            elif name == "relu" and weights.nodes[operands[0]].name == "r2":
+                known[k] = values[0]  # a sum of squares here
             else:
-                found = code.bounded(a, code.constant(0.0), "olt")
-            self.known[k] = found
-        self.results = [(None if node is None else self.known[node], scale) for node, scale in weights.results]
+                known[k] = OPERATIONS[name](code, *values, number)
+        self.results = [(None if node is None else known[node], scale) for node, scale in weights.results]
 
     def weight(self, number: int, factor: float) -> str:
         """A weight times a number."""
@@ -251,14 +255,6 @@ class _Result(NamedTuple):
     odd: bool
 
 
-class _Place(NamedTuple):
-    """Names of an array, the length of its lines, and a point."""
-
-    array: str
-    length: str
-    point: str
-
-
 class _Block:
     """Writes the function of one block of rows and a range of columns.
 
@@ -296,13 +292,11 @@ class _Block:
             self._store_shares(result)
         for r, sums in enumerate(self.sums):
             self._store_sums(r, sums)
-        zero, starts = (
-            self.loop.constant(0.0),
-            [(r, k) for r, names in enumerate(self.starts) for k in range(len(names))],
-        )
+        zero = self.loop.constant(0.0)
         phis = [
-            f"  {self.starts[r][k]} = phi {self.vector} [ {zero}, %entry ], [ {self.sums[r][k]}, %loop ]"
-            for r, k in starts
+            f"  {start} = phi {self.vector} [ {zero}, %entry ], [ {total}, %loop ]"
+            for starts, totals in zip(self.starts, self.sums, strict=True)
+            for start, total in zip(starts, totals, strict=True)
         ]
         return BLOCK.format(
             name=name,
@@ -330,21 +324,21 @@ class _Block:
             place += size
         return Points(**found)
 
-    def _address(self, code: Code, k: int, place: _Place) -> str:
-        """Of the number at a point in the k-th line of an array."""
-        number = code.value(f"add i64 {code.value(f'mul i64 {place.length}, {k}')}, {place.point}")
-        return code.value(f"getelementptr double, ptr {place.array}, i64 {number}")
+    def _address(self, code: Code, k: int, array: str, length: str, point: str) -> str:
+        """Of the number at a point in the k-th line of an array whose lines have a length."""
+        number = code.value(f"add i64 {code.value(f'mul i64 {length}, {k}')}, {point}")
+        return code.value(f"getelementptr double, ptr {array}, i64 {number}")
 
     def _spread(self, k: int, at: str) -> str:
         """An input of a row, in all lanes."""
         code, v = self.head, self.vector
-        number = code.value(f"load double, ptr {self._address(code, k, _Place('%rows', '%m', at))}")
+        number = code.value(f"load double, ptr {self._address(code, k, '%rows', '%m', at)}")
         first = code.value(f"insertelement {v} poison, double {number}, i32 0")
         return code.value(f"shufflevector {v} {first}, {v} poison, <{v.lanes} x i32> zeroinitializer")
 
     def _column(self, k: int) -> str:
         """An input of the columns."""
-        address = self._address(self.loop, k, _Place("%columns", "%n", "%j"))
+        address = self._address(self.loop, k, "%columns", "%n", "%j")
         return self.loop.value(f"load {self.vector}, ptr {address}, align 8")
 
     def _products(self, term: Term, at: _Lowering, factor: float) -> list[tuple[tuple[str, str], tuple[str, str]]]:
@@ -362,14 +356,14 @@ class _Block:
 
     def _store_shares(self, result: _Result) -> None:
         for k in result.places if result.terms else ():
-            address = self._address(self.loop, k, _Place("%out", "%n", "%j"))
+            address = self._address(self.loop, k, "%out", "%n", "%j")
             self._accumulate(self.loop, self.vector, address, self.shares[k], "fsub" if result.odd else "fadd")
 
     def _store_sums(self, r: int, sums: list[str]) -> None:
         code, v = self.tail, self.vector
         for k in [k for result in self.results if result.terms for k in result.places]:
             total = code.value(f"call reassoc double @llvm.vector.reduce.fadd.{v.suffix}(double 0.0, {v} {sums[k]})")
-            address = self._address(code, k, _Place("%out", "%m", f"%i{r}"))
+            address = self._address(code, k, "%out", "%m", f"%i{r}")
             self._accumulate(code, "double", address, total, "fadd")
 
     def _accumulate(self, code: Code, kind: object, address: str, number: str, operation: str) -> None:

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 from diffeo_calib.kernels.profiles import SHIPPED, Profile
 from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula
 
-MOST_FACTORS = 8
-"""Of a power in a profile."""
+MOST_FACTORS = 8  # of a power in a profile
 
 
 class Node(NamedTuple):

@@ -36,19 +36,15 @@ from diffeo_calib.kernels.reductions.symbols import Weights, recorded
 CPU_ELEMENTS = 1 << 18
 """Pairs in a tile: 2 MiB in float64. Its operations last so long that Python's own time is small, and that threads wait
 rarely for its lock; the few matrices of a formula stay in a usual cache."""
-LARGE_PAIRS = 1 << 22
-"""Pairs from which a sum on a CPU runs in several threads."""
+LARGE_PAIRS = 1 << 22  # pairs from which a sum on a CPU runs in several threads
 PARTS = 16
 """Parts of a sum that runs in several threads. Their number does not depend on that of the threads, so that the result
 is the same to the last digit; they are many, so that a thread that loses its core to another process does fewer."""
-SHARED_PARTS = 64
-"""Slices of rows that several processes share."""
+SHARED_PARTS = 64  # slices of rows that several processes share
 TIMED_NUMBERS, TIMINGS = 1 << 13, 20
 """Exponentials of a measurement, a tenth of a millisecond of each function, and its repetitions."""
-CLEARLY_LESS = 0.85
-"""Ratio of times that counts: a smaller difference could be decided otherwise in the next process."""
-GPU_ELEMENTS = 1 << 26
-"""Pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64."""
+CLEARLY_LESS = 0.85  # ratio of times that counts: a smaller difference could be decided otherwise in the next process
+GPU_ELEMENTS = 1 << 26  # pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64
 Weighing = Callable[[Points, Points], tuple[list[Tensor], list[float]]]
 """The weights of one tile, matrices (M, N) and their scales; they hold until its next call in the same thread."""
 Chosen = Callable[[Sequence[Any]], list[Any]]
