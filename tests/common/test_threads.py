@@ -72,11 +72,6 @@ def test_the_setting_is_restored_after_an_error() -> None:
         assert torch.get_num_threads() == 3
 
 
-def test_one_thread_stays_one_thread() -> None:
-    with torch_threads(1), small_work(), large_work(LARGE_MATRIX):
-        assert torch.get_num_threads() == allowed_threads() == 1
-
-
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_run_on_one_thread_each_and_come_back_in_order(count: int) -> None:
     with torch_threads(count):

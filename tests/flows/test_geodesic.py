@@ -16,7 +16,6 @@ from math_bank import (
 )
 from torch import Tensor
 
-from diffeo_calib.flows import geodesic
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
@@ -82,28 +81,6 @@ def test_momenta_are_transported_as_cotangents(case: Case) -> None:
         errors.append(float((flow.end[1] - expected).abs().max()))
     assert errors[-1] <= 1e-6
     assert min(slopes(errors)) >= 3.5
-
-
-def test_reversed_flow_is_the_inverse() -> None:
-    """The geodesic from the end with the opposite momentum undoes the flow, up to O(h^4)."""
-    case = case_named("gaussian-mixed")
-    x = case.points(M, seed=1)
-    errors = []
-    for steps in (4, 8, 16):
-        flow = flow_of(case, steps)
-        back = Flow(case.kernel, flow.end[0], -flow.end[1], RK4(steps))
-        errors.append(float((back(flow(x)) - x).abs().max()))
-    assert errors[-1] <= 1e-7
-    assert min(slopes(errors)) >= 3.85
-
-
-@pytest.mark.parametrize("rows", [1, 3, M - 1, M])
-def test_blocks_of_passive_points_change_nothing(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
-    flow, x = flow_of(case_named("sum")), case_named("sum").points(M, seed=1)
-    whole, jacobian = flow.with_jacobian(x)
-    monkeypatch.setattr(geodesic, "BLOCK_ROWS", rows)
-    torch.testing.assert_close(flow(x), whole, rtol=0, atol=1e-14)
-    torch.testing.assert_close(flow.with_jacobian(x), (whole, jacobian), rtol=0, atol=1e-13)
 
 
 def test_no_passive_points() -> None:

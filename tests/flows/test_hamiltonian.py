@@ -96,20 +96,3 @@ def test_total_momentum_is_conserved(case: Case) -> None:
     state = start(case, 0.6)
     end = run(case.kernel, state, 2)
     torch.testing.assert_close(end[1].sum(0), state[1].sum(0), rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("kernel", [dc.Gaussian(0.8, 1.3), dc.Matern(0.9, 2.5), dc.Cauchy(1.2)], ids=repr)
-def test_angular_momentum_is_conserved(kernel: Kernel) -> None:
-    """Isotropic kernels are invariant under rotations: d/dt sum_i q_i x a_i = 0."""
-    state = torch.stack([normal(N, 2, seed=2), normal(N, 2, seed=3)])
-    rate = geodesic_field(kernel, state)
-    total = torch.linalg.det(torch.stack([rate[0], state[1]], 1)) + torch.linalg.det(
-        torch.stack([state[0], rate[1]], 1)
-    )
-    torch.testing.assert_close(total.sum(), torch.zeros((), dtype=torch.float64), rtol=0, atol=1e-13)
-
-
-def test_a_single_landmark_moves_straight() -> None:
-    q, a = normal(1, 2, seed=1), normal(1, 2, seed=2)
-    end = run(dc.Gaussian(0.7, 1.5), torch.stack([q, a]), 1)
-    torch.testing.assert_close(end, torch.stack([q + 1.5 * a, a]), rtol=0, atol=1e-14)

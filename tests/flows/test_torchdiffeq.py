@@ -213,11 +213,6 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> N
         TorchDiffEq(**arguments)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 10, 49])
-def test_every_whole_number_of_steps_is_a_step_size(count: int) -> None:
-    assert TorchDiffEq(step_size=1 / count).intervals == count
-
-
 @every_adaptive
 @pytest.mark.parametrize("adjoint", [False, True])
 def test_momenta_that_are_too_large_are_reported(method: str, adjoint: bool) -> None:

@@ -25,8 +25,7 @@ from diffeo_calib.kernels.reductions import backends, keops
 from diffeo_calib.kernels.reductions import fused as sums
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
 from diffeo_calib.kernels.reductions.fused import Fused
-from diffeo_calib.kernels.reductions.loops import Program, Vector
-from diffeo_calib.kernels.reductions.symbols import recorded
+from diffeo_calib.kernels.reductions.loops import Program
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 pytest.importorskip("llvmlite")
@@ -243,17 +242,6 @@ def test_a_process_forked_while_a_thread_compiles_can_compile() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_many_rows_of_few_columns_make_few_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small tiles would take longer to hand to a thread than to compute."""
-    parts: list[int] = []
-    in_parallel = sums.in_parallel
-    monkeypatch.setattr(sums, "in_parallel", lambda f, p: parts.append(len(p)) or in_parallel(f, p))
-    i, j = points(sums.LARGE_PAIRS // 100 + 1, 1), points(100, 2)
-    assert_same(fused(FIELD, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-11)
-    assert len(parts) == 1
-    assert parts[0] <= sums.SHARED_PARTS
-
-
 def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Fused()
     monkeypatch.setattr(Program, "code", lambda self: ("nonsense", [1.0]))
@@ -262,13 +250,3 @@ def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> N
         assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
     assert not backend.available()
     assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
-
-
-def test_code_is_short() -> None:
-    """A block of rows has one loop, and every instruction of it is written once per row."""
-    inputs = (("features", 3), ("momenta", 3))
-    weights = recorded(FIELD, GaussianProfile())
-    assert weights is not None
-    text, factors = Program(FIELD, weights, inputs, Vector(8)).code()
-    assert factors == [1.0]
-    assert text.count("shl <8 x i64>") == 2 * 8

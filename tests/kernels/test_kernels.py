@@ -65,12 +65,6 @@ def test_points_with_other_coordinates_are_refused(case: Case) -> None:
 
 
 @every_case
-def test_value_at_a_point_is_the_output_matrix(case: Case) -> None:
-    x = case.points(1, seed=1)
-    torch.testing.assert_close(case.kernel.matrix(x, x), case.at_zero(), rtol=1e-14, atol=1e-14)
-
-
-@every_case
 def test_matrix_is_symmetric_and_positive_semi_definite(case: Case) -> None:
     x = torch.cat([case.points(20, seed=1), case.points(4, seed=1) + 1e-4])
     matrix = case.kernel.matrix(x, x)
@@ -88,21 +82,6 @@ def test_kernel_has_the_period_of_its_space(case: Case) -> None:
         case.kernel.field_and_jacobian(x + turns, q, a), case.kernel.field_and_jacobian(x, q, a), strict=True
     ):
         torch.testing.assert_close(actual, expected, rtol=0, atol=2e-13)
-
-
-@every_case
-def test_kernel_is_invariant_under_translation(case: Case) -> None:
-    x, q, a = data(case)
-    shift = normal(case.dim, seed=5)
-    moved = case.kernel.field(x + shift, q + shift, a)
-    torch.testing.assert_close(moved, case.kernel.field(x, q, a), rtol=0, atol=1e-13)
-
-
-@every_case
-def test_field_is_matrix_times_momenta(case: Case) -> None:
-    x, q, a = data(case)
-    expected = (case.kernel.matrix(x, q) @ a.flatten()).view(M, case.dim)
-    torch.testing.assert_close(case.kernel.field(x, q, a), expected, rtol=1e-13, atol=1e-13)
 
 
 @every_case
@@ -239,11 +218,6 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
 def test_bad_hyper_parameters_are_refused(make: Callable[[], object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()
-
-
-@every_case
-def test_every_kernel_fits_its_own_space(case: Case) -> None:
-    case.kernel.check(case.dim, "joint_kernel")
 
 
 WRONG_DIMENSION: dict[str, tuple[Kernel, int]] = {

@@ -277,15 +277,6 @@ def test_a_flow_that_folds_space_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         deformation.linearise(deformation.x)
 
 
-def test_momenta_as_one_vector() -> None:
-    one, two = ARMS["parameters"].momenta(1.0), ARMS["parameters"].momenta(3.0)
-    vector = one.flatten()
-    assert vector.numel() == sum(t.numel() for t in one.tensors)
-    for actual, expected in zip(one.unflatten(vector).tensors, one.tensors, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
-    torch.testing.assert_close(one.towards(two, 0.25).flatten(), 1.5 * vector, rtol=1e-15, atol=0)
-
-
 @every_arm
 def test_gradient_of_the_end_in_all_momenta(arm: Arm) -> None:
     """Backpropagation through both flows and the nominal map, compared with finite differences."""

@@ -108,21 +108,6 @@ def test_erratum_3_the_energy_drifts_with_p_div_v_and_not_without(bed: dc.Proble
     assert printed.energy > corrected.energy
 
 
-@pytest.mark.slow
-def test_erratum_4_sigma_100_is_no_sigma() -> None:
-    """As the sigma of (5), 100 leaves the model undeformed; as a weight or as 1 / sigma it calibrates."""
-    x = uniform(300, 2, seed=2)
-
-    def error(sigma: float) -> float:
-        model = dc.fit(rr_problem(6, noise=sigma), dc.LBFGS(max_iterations=15), dc.RK4(2), formulation="eulerian").model
-        return float((model(x) - elastic_rr.real(x)).norm(dim=1).mean())
-
-    nominal = float((elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1).mean())
-    assert error(100.0) > 0.9 * nominal
-    for weight in (100.0, 5000.0):  # 1 / (2 sigma^2)
-        assert error((2 * weight) ** -0.5) < 0.05 * nominal
-
-
 def gaussian_derivative(order: int, x: np.ndarray, variance: float) -> np.ndarray:
     """The derivative of exp(-x^2 / (2 variance)) of an even order, by Hermite polynomials."""
     polynomial = hermite_e.hermeval(x / variance**0.5, [0.0] * order + [1.0])
