@@ -37,7 +37,7 @@ from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.fitting.objective import Objective, tangent
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.geodesic import energy
-from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
+from diffeo_calib.flows.integrators import RK4, Integrator, Run
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
@@ -125,12 +125,11 @@ class EulerianFlow:
         integrator: Integrator,
         task_dim: int,
     ) -> None:
-        self.equations, self.integrator, self.x, self.task_dim = equations, integrator, x, task_dim
+        self.equations, self.x, self.task_dim = equations, x, task_dim
         self.joint_kernel, self.task_kernel = kernels
         self._curvature = start.curvature
-        self._stages: list[Tensor] = []
-        packed = torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1)
-        self.nodes = integrator.nodes(self._recorded, packed)
+        self._run = Run(integrator, self.rates, torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1))
+        self.nodes = self._run.nodes
 
     def __call__(self, start: Kinematics, x: Tensor) -> tuple[Tensor, Tensor]:
         """(20): k1 (M, m) and the transported Dk1 (M, m, n) at points x (M, n), from k0 there (``start``)."""
@@ -141,8 +140,7 @@ class EulerianFlow:
             return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
 
         packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
-        controls = {"stages": self._stages, "controls": self.nodes[0], "control_field": self.rates}
-        end = integrate_alongside(self.integrator, field, packed, **controls)[-1]
+        end = self._run.alongside(field, packed)[-1]
         return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -155,11 +153,6 @@ class EulerianFlow:
         """L_V v at the points, with the corrected sign -Dk^T P: (N, n)."""
         _, momenta, jacobian = self.unpack(state)
         return self.equations.sign * torch.einsum("imn,im->in", jacobian, momenta)
-
-    def _recorded(self, _: int, state: Tensor) -> Tensor:
-        if self.integrator.replayable:
-            self._stages.append(state)
-        return self.rates(state)
 
     def rates(self, state: Tensor) -> Tensor:
         """Right-hand side of (17) and (19) for a state: (N, 2 m + m n)."""
