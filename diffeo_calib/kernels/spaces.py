@@ -81,39 +81,67 @@ class FeatureMap:
         """Indices of lines and of circles in the coordinates of x, and in the length scales."""
         return [(_as_slice([self.columns[k] for k in places]), _as_slice(places)) for places in self._places]
 
-    def _parts(self, x: Tensor, *others: Tensor) -> list[list[Tensor]]:
-        """The lines, then the circles, of points and of others, with their inverse scales."""
-        scales = (1.0 / self.lengthscale if self.lengthscale.requires_grad else self._fixed_scales).to(x)
-        scales = scales.expand(len(self.columns))
-        return [[t[..., own] for t in (x, *others)] + [scales[scaled]] for own, scaled in self._selections]
+    def _parts(self, x: Tensor, *others: Tensor) -> list[list[Tensor] | None]:
+        """The lines and the circles of points and of others, with their inverse scales; None where there are none."""
+        scales = self._scales() if self.lengthscale.requires_grad else self._fixed_scales
+        scales = scales.to(x)
+        return [
+            [*(t[..., own] for t in (x, *others)), scales[scaled]] if places else None
+            for places, (own, scaled) in zip(self._places, self._selections, strict=True)
+        ]
+
+    def _scales(self) -> Tensor:
+        return (1.0 / self.lengthscale).expand(len(self.columns))
 
     @cached_property
     def _fixed_scales(self) -> Tensor:
         with torch.inference_mode(False):  # kept, and used in derivatives later
-            return 1.0 / self.lengthscale
+            return self._scales()
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D)."""
-        (line, scale), (angle, by) = self._parts(x)
-        return _joined([line * scale, angle.cos() * by, angle.sin() * by])
+        lines, circles, found = *self._parts(x), []
+        if lines is not None:
+            found.append(lines[0] * lines[1])
+        if circles is not None:
+            angle, scale = circles
+            found += [angle.cos() * scale, angle.sin() * scale]
+        return _joined(found)
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""
-        (_, move, scale), (angle, turn, by) = self._parts(x, dx)
-        return _joined([move * scale, -angle.sin() * turn * by, angle.cos() * turn * by])
+        lines, circles, found = *self._parts(x, dx), []
+        if lines is not None:
+            found.append(lines[1] * lines[2])
+        if circles is not None:
+            angle, turn, scale = circles
+            found += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
+        return _joined(found)
 
     def pull(self, x: Tensor, g: Tensor) -> Tensor:
         """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
-        (_, scale), (angle, by) = self._parts(x)
+        lines, circles, found = *self._parts(x), []
         g_line, g_cos, g_sin = self._split(g)
-        return self._scatter(x, [g_line * scale, (angle.cos() * g_sin - angle.sin() * g_cos) * by])
+        if lines is not None:
+            found.append(g_line * lines[1])
+        if circles is not None:
+            angle, scale = circles
+            found.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
+        return self._scatter(x, found)
 
     def pull_derivative(self, x: Tensor, dx: Tensor, g: Tensor) -> Tensor:
         """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
-        _, (angle, turn, by) = self._parts(x, dx)
         g_line, g_cos, g_sin = self._split(g)
-        turned = -(angle.cos() * g_cos + angle.sin() * g_sin) * by * turn
-        return self._scatter(x, [torch.zeros_like(g_line), turned])
+        found = [torch.zeros_like(g_line)]
+        _, circles = self._parts(x, dx)
+        if circles is not None:
+            angle, turn, scale = circles
+            found.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)
+        return self._scatter(x, found)
+
+    @cached_property
+    def _ordered(self) -> list[int]:
+        return [self.columns[k] for places in self._places for k in places]
 
     def _split(self, g: Tensor) -> Sequence[Tensor]:
         lines, circles = map(len, self._places)
@@ -121,7 +149,7 @@ class FeatureMap:
 
     def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
         """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
-        values, columns = _joined(parts), [self.columns[k] for places in self._places for k in places]
+        values, columns = _joined(parts), self._ordered
         if isinstance(where := _as_slice(columns), slice):  # without a copy of the indices to the device
             before, after = where.start, x.shape[-1] - where.stop
             return torch.nn.functional.pad(values, (before, after)) if before or after else values
@@ -130,9 +158,7 @@ class FeatureMap:
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
-    """Features side by side, without those that no coordinate has."""
-    present = [part for part in parts if part.shape[-1]]
-    return present[0] if len(present) == 1 else torch.cat(present, -1)
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
 def _as_slice(columns: list[int]) -> slice | list[int]:

@@ -179,9 +179,10 @@ class Compiled(NamedTuple):
         arguments = left.values.data_ptr(), left.length, right.values.data_ptr(), right.count, right.length
 
         def part(some: Sequence[int]) -> Tensor:
-            total = zeros() if whole is None else whole
-            for tile in some:
-                place = tile * height, min((tile + 1) * height, left.count), side, rows is None
+            total, whole_range = zeros() if whole is None else whole, len(some) == -(-left.count // height)
+            for tile in some[:1] if whole_range else some:
+                last = left.count if whole_range else min((tile + 1) * height, left.count)
+                place = tile * height, last, height, side, rows is None
                 self.function(*arguments, total.data_ptr(), *place)
             return total
 

@@ -23,7 +23,7 @@ from diffeo_calib.kernels.reductions.symbols import Weights
 
 ROWS = ((4, 8), (12, 4), (32, 2))
 """Sums of a row, and the number of rows of a block up to it; beyond it one row. Measured with 16 and 32 registers."""
-ARGUMENTS = 10  # of the function of a program
+ARGUMENTS = 11  # of the function of a program
 EXP2 = (
     1.0,
     0.6931471805599516,
@@ -152,7 +152,7 @@ class Program:
         sizes = {None: 1, **self.sizes}
         return [sizes[terms[0].vector] * sizes[terms[0].apart] for terms in self.formula.results]
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Sums of a row."""
         return sum(self.outputs)
@@ -162,7 +162,7 @@ class Program:
         """Of a block."""
         return next((rows for outputs, rows in ROWS if self.count <= outputs), 1)
 
-    @property
+    @cached_property
     def group(self) -> int:
         """Points that are processed together; their number is a multiple of it."""
         return max(self.vector.lanes, self.rows)
@@ -405,20 +405,25 @@ end:
 }}
 """
 DRIVER = """
-define void @sums(ptr %rows, i64 %m, ptr %columns, i64 %n, i64 %s, ptr %out, i64 %first, i64 %last, i64 %side,
-                  i64 %mirrored) #0 {{
+define void @sums(ptr %rows, i64 %m, ptr %columns, i64 %n, i64 %s, ptr %out, i64 %first, i64 %last, i64 %height,
+                  i64 %side, i64 %mirrored) #0 {{
 entry:
   %triangle = icmp ne i64 %mirrored, 0
-  %start = select i1 %triangle, i64 %first, i64 0
+  br label %tile
+tile:
+  %a0 = phi i64 [ %first, %entry ], [ %a1.far, %tile.next ]
+  %a1.far = add i64 %a0, %height
+  %a1 = call i64 @llvm.smin.i64(i64 %a1.far, i64 %last)
+  %start = select i1 %triangle, i64 %a0, i64 0
   br label %column
 column:
-  %b0 = phi i64 [ %start, %entry ], [ %b1.far, %column.next ]
+  %b0 = phi i64 [ %start, %tile ], [ %b1.far, %column.next ]
   %b1.far = add i64 %b0, %side
   %b1 = call i64 @llvm.smin.i64(i64 %b1.far, i64 %n)
-  %own = icmp eq i64 %b0, %first
+  %own = icmp eq i64 %b0, %a0
   br label %row
 row:
-  %i = phi i64 [ %first, %column ], [ %i1, %row.next ]
+  %i = phi i64 [ %a0, %column ], [ %i1, %row.next ]
   %i1 = add i64 %i, {rows}
   br i1 %triangle, label %half, label %all
 all:
@@ -436,14 +441,17 @@ mirror:
   call void @mirrored(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %low, i64 %b1)
   br label %row.next
 row.next:
-  %row.more = icmp slt i64 %i1, %last
+  %row.more = icmp slt i64 %i1, %a1
   br i1 %row.more, label %row, label %column.next
 column.next:
   %column.more = icmp slt i64 %b1.far, %n
-  br i1 %column.more, label %column, label %end
+  br i1 %column.more, label %column, label %tile.next
+tile.next:
+  %tile.more = icmp slt i64 %a1.far, %last
+  br i1 %tile.more, label %tile, label %end
 end:
   ret void
 }}
 """
-"""Rows ``first`` to ``last`` with all columns; or a row of tiles of a triangle, from the diagonal on, where points of
-a diagonal group meet all of their group, and later points count both ways."""
+"""Rows ``first`` to ``last`` with all columns; or rows of tiles of a triangle, from the diagonal on, where points of a
+diagonal group meet all of their group, and later points count both ways."""

@@ -44,6 +44,13 @@ class Weights:
     results: tuple[tuple[int | None, float], ...]
 
     @cached_property
+    def _hash(self) -> int:
+        return hash((self.nodes, self.results))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
     def uses(self) -> list[int]:
         """How often every node is read, by results and by nodes that are read themselves."""
         found = [0] * len(self.nodes)
