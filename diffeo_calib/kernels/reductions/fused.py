@@ -12,12 +12,11 @@ import hashlib
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cache, lru_cache, reduce
-from itertools import count
+from functools import cache, partial, reduce
 from threading import RLock
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,11 +26,11 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import SHIPPED, Profile
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program, SymbolicPairs
-from diffeo_calib.kernels.reductions.fused.symbols import Code, Vector
+from diffeo_calib.kernels.reductions.formulas import Formula, Points, SumBackend
 from diffeo_calib.kernels.reductions.keops import cache_folder, warn
-from diffeo_calib.kernels.reductions.tiled import LARGE_PAIRS, PARTS, SHARED_PARTS, dealt
+from diffeo_calib.kernels.reductions.loops import ARGUMENTS, Program, Vector
+from diffeo_calib.kernels.reductions.symbols import Weights, recorded
+from diffeo_calib.kernels.reductions.tiled import LARGE_PAIRS, PARTS, SHARED_PARTS, Chosen, dealt
 
 DIGEST = hashlib.sha256().digest_size
 LOCK = RLock()
@@ -73,22 +72,15 @@ class Machine:
         # the addresses of the small code model, and LLVM ends the process
         self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), self.target, use_lmm=True)
 
-    def functions(self, text: str, names: Mapping[str, int]) -> list[Any]:
-        """Compile a module, or load what an earlier process compiled, and return some of its functions.
-
-        Args:
-            names: of the functions, with the number of their arguments: addresses or 64-bit integers.
-        """
+    def function(self, text: str) -> Callable[..., None]:
+        """Compile the function ``sums`` of a module, or load what an earlier process compiled."""
         mark = hashlib.sha256(f"{self.mark}\n{text}".encode()).hexdigest()[:24]
-        for name in names:
-            text = text.replace(f"@{name}(", f"@{name}_{mark}(")
         with LOCK:
             if mark not in self.loaded:
-                self._load(mark, text)
+                self._load(mark, text.replace("@sums(", f"@sums_{mark}("))
                 self.loaded.add(mark)
-            kinds = [ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * arguments) for arguments in names.values()]
-            addresses = [self.engine.get_function_address(f"{name}_{mark}") for name in names]
-            return [kind(address) for kind, address in zip(kinds, addresses, strict=True)]
+            address = self.engine.get_function_address(f"sums_{mark}")
+            return ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * ARGUMENTS)(address)
 
     def _load(self, mark: str, text: str) -> None:
         code = _kept(mark)
@@ -126,17 +118,11 @@ def _kept(mark: str) -> bytes | None:
     return code if hashlib.sha256(code).digest() == digest else None
 
 
-Chosen = Callable[[Sequence[Any]], list[Any]]
-TILE_BYTES = 20 << 10
-"""Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
-CACHE_LINE = 64
-"""Bytes."""
-MOST_GROUP = 16
-"""Largest number of points that a program processes together."""
-MOST_OUTPUTS = 96
-"""Sums per row beyond which products of matrices take less time."""
-MOST_INPUTS = 64
-"""Numbers of a point beyond which compiling takes seconds, and products of matrices take less time."""
+TILE_BYTES = 20 << 10  # inputs and sums of the columns of a tile: they stay in the first cache of any processor
+CACHE_LINE = 64  # bytes
+MOST_GROUP = 16  # largest number of points that a program processes together
+MOST_OUTPUTS = 96  # sums per row beyond which products of matrices take less time
+MOST_INPUTS = 64  # numbers of a point beyond which compiling takes seconds, and products of matrices take less time
 MOST_VARIANTS = 64
 """Sums with profiles of one class of the user's that are compiled. With more, a parameter is being optimised, and
 compiling takes too long."""
@@ -166,12 +152,11 @@ class _Lines(NamedTuple):
 
 
 class Compiled(NamedTuple):
-    """A program, the factors of its results, and its two functions."""
+    """A program, the factors of its results, and its function."""
 
     program: Program
     factors: list[float]
-    symmetric: Callable[..., None]
-    rectangular: Callable[..., None]
+    function: Callable[..., None]
 
     def totals(self, rows: Points | None, columns: Points, mine: Chosen = list) -> Tensor:
         """All sums without factors (outputs, count), or the parts of a process: the shares of all add up to them.
@@ -181,28 +166,30 @@ class Compiled(NamedTuple):
             columns: the N points of the sum.
             mine: chooses from tiles of rows those of this process.
         """
-        at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
-        large = len(at.features) * right.count >= LARGE_PAIRS
+        right = _Lines.of(columns, self.program)
+        left = right if rows is None else _Lines.of(rows, self.program)
         sizes = 8 * (sum(self.program.sizes.values()) + self.program.count)  # bytes of a column
-        side = max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)  # points, a power of two
-        if rows is None:
-            tiles = mine(range(-(-right.count // side)))
-            if not large or not tiles:
-                return self._over_pairs(right, side, tiles)
-            return reduce(Tensor.add_, in_parallel(lambda t: self._over_pairs(right, side, t), dealt(tiles, PARTS)))
-        left = _Lines.of(rows, self.program)
-        # many rows of few columns: not so many tiles that handing them to threads takes longer than the sums
-        height = max(side, -(-left.count // (SHARED_PARTS * MOST_GROUP)) * MOST_GROUP)
-        totals, tiles = self._zeros(left), mine(range(-(-left.count // height)))
-        columns_ = (right.values.data_ptr(), right.count, right.length)
+        side = height = max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)  # points, a power of two
+        if rows is not None:
+            # many rows of few columns: not so many tiles that handing them to threads takes longer than the sums
+            height = max(side, -(-left.count // (SHARED_PARTS * MOST_GROUP)) * MOST_GROUP)
+        tiles = mine(range(-(-left.count // height)))
+        zeros = partial(torch.zeros, self.program.count, left.length, dtype=torch.float64, device=HOST)
+        whole = None if rows is None else zeros()  # to which tiles of rows add in different places
+        arguments = left.values.data_ptr(), left.length, right.values.data_ptr(), right.count, right.length
 
-        def part(tile: int) -> None:
-            first, last = tile * height, min((tile + 1) * height, left.count)
-            self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
+        def part(some: Sequence[int]) -> Tensor:
+            total, whole_range = zeros() if whole is None else whole, len(some) == -(-left.count // height)
+            for tile in some[:1] if whole_range else some:
+                last = left.count if whole_range else min((tile + 1) * height, left.count)
+                place = tile * height, last, height, side, rows is None
+                self.function(*arguments, total.data_ptr(), *place)
+            return total
 
-        for _ in in_parallel(part, tiles) if large else map(part, tiles):
-            pass
-        return totals
+        if left.count * right.count < LARGE_PAIRS or not tiles:
+            return part(tiles)
+        parts = in_parallel(part, dealt(tiles, PARTS) if whole is None else [[tile] for tile in tiles])
+        return reduce(lambda total, more: total.add_(more) if whole is None else whole, parts)
 
     def results(self, totals: Tensor, rows: int) -> tuple[Tensor, ...]:
         """The results of the formula at M rows, from all sums."""
@@ -218,30 +205,17 @@ class Compiled(NamedTuple):
             first += size
         return tuple(found)
 
-    def _zeros(self, like: _Lines) -> Tensor:
-        return torch.zeros(self.program.count, like.length, dtype=torch.float64, device=HOST)
 
-    def _over_pairs(self, points: _Lines, side: int, tiles: list[int]) -> Tensor:
-        """Sums over some tiles of the triangle of pairs."""
-        totals, numbers = self._zeros(points), _numbers(tuple(tiles))
-        if tiles:
-            sizes = (points.values.data_ptr(), points.count, points.length)
-            self.symmetric(*sizes, totals.data_ptr(), numbers.data_ptr(), len(tiles), side)
-        return totals
-
-
-class Fused:
+class Fused(SumBackend):
     """Evaluates sums in compiled loops, on a CPU.
 
     Attributes:
         failed: whether LLVM has failed; it is not tried again then.
     """
 
-    differentiable: ClassVar[bool] = False
-
     def __init__(self) -> None:
         self.failed = False
-        self._programs: dict[Hashable, Compiled | None] = {}
+        self._programs: dict[tuple[Formula, Weights, tuple[tuple[str, int], ...]], Compiled | None] = {}
         self._own = Counter[type]()
 
     def available(self) -> bool:
@@ -249,7 +223,6 @@ class Fused:
         return not self.failed and _reason() is None
 
     def usable(self) -> bool:
-        """Whether the backend is expected to work on this machine; warns once if not."""
         if not self.available():
             warn(f"{_reason() or 'LLVM has failed'}.")
         return self.available()
@@ -260,26 +233,24 @@ class Fused:
         fitting = all(t.dtype == torch.float64 and t.device.type == "cpu" for t in tensors)
         if not fitting or not self.available():
             return None
-        inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
-        try:
-            key = (formula, profile if type(profile) in SHIPPED else _instructions(formula, profile), inputs)
-            if key not in self._programs:
-                self._programs[key] = self._compiled(formula, profile, inputs)
-        except Exception:  # a profile of the user may raise anything where it gets symbols, and works with tensors
+        weights = recorded(formula, profile)
+        if weights is None:
             return None
+        key = formula, weights, tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
+        if key not in self._programs:
+            self._programs[key] = self._compiled(Program(*key, Vector(machine().vector_bytes // 8)), type(profile))
         return self._programs[key]
 
-    def _compiled(self, formula: Formula, profile: Profile, inputs: tuple[tuple[str, int], ...]) -> Compiled | None:
-        program = Program(formula, profile, inputs, Vector(machine().vector_bytes // 8))
+    def _compiled(self, program: Program, profile: type[Profile]) -> Compiled | None:
         if program.count > MOST_OUTPUTS or sum(program.sizes.values()) > MOST_INPUTS:
             return None
-        if type(profile) not in SHIPPED:
-            if self._own[type(profile)] == MOST_VARIANTS:
+        if profile not in SHIPPED:
+            if self._own[profile] == MOST_VARIANTS:
                 return None
-            self._own[type(profile)] += 1
+            self._own[profile] += 1
         text, factors = program.code()
         try:
-            return Compiled(program, factors, *machine().functions(text, LOOPS))
+            return Compiled(program, factors, machine().function(text))
         except Exception as error:  # LLVM may raise anything
             self.failed = True
             warn(f"LLVM could not compile a kernel sum ({error}).")
@@ -288,7 +259,6 @@ class Fused:
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
     ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, or None where it is not for this backend; not differentiable by autograd."""
         compiled = self.program(formula, profile, rows, columns)
         if compiled is None:
             return None
@@ -296,20 +266,7 @@ class Fused:
         return compiled.results(compiled.totals(rows, columns), len(at.features))
 
 
-FUSED = Fused()
-"""One for the whole program, which keeps what it has compiled."""
-
-
-@lru_cache(maxsize=256)
-def _numbers(tiles: tuple[int, ...]) -> Tensor:
-    return torch.tensor(tiles, dtype=torch.int64, device=HOST)
-
-
-def _instructions(formula: Formula, profile: Profile) -> Hashable:
-    """Compiled form of a formula with a profile, whose constants may change between calls."""
-    code, sides = Code(Vector(1), count()), (Points(*([f"%{side}{k}"] for k in range(4))) for side in "ij")
-    weights = formula.weights(SymbolicPairs(code), profile, *sides)
-    return (*code.lines, *((w.value, w.scale) for w in weights))
+FUSED = Fused()  # one for the whole program, which keeps what it has compiled
 
 
 @cache
