@@ -25,7 +25,7 @@ from diffeo_calib.calibration.scales.cross_validation import (
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.regions import region_factor, region_scale
+from diffeo_calib.regression.regions import region_scale
 from diffeo_calib.robots import SimulatedArm
 
 BRIEF = FoldLimits(iterations=1)
@@ -166,32 +166,6 @@ def test_scales_chosen_on_few_poses_fit_these_poses() -> None:
     )
     assert optimistic < 0.75
     assert ratio > 1.15 * optimistic  # both are drawn towards one by the prior
-
-
-def test_ctrl_c_gives_no_factor() -> None:
-    setting = built("sliding")
-    data, seen = setting.tangent_data, []
-
-    def progress(task: str, done: int, total: int) -> None:
-        seen.append((task, done, total))
-        if done == 2:
-            raise KeyboardInterrupt
-
-    found = cross_validated_inflation(
-        setting.scales, setting.scales, data, groups(data), limits=BRIEF, progress=progress
-    )
-    assert found is None
-    assert seen == [("cross-validation", 0, 5), ("cross-validation", 1, 5), ("cross-validation", 2, 5)]
-
-
-def test_region_factor_is_that_of_student_s_t() -> None:
-    """Gaussian errors in three coordinates whose variance was estimated with nu degrees of freedom."""
-    rng = np.random.default_rng(0)
-    for freedom in (8, 30):
-        estimated = rng.chisquare(freedom, 200_000) / freedom
-        squares = (rng.standard_normal((200_000, 3)) ** 2).sum(1) / estimated
-        inside = (squares / region_factor(freedom, 3) < chi2.ppf(0.95, 3)).mean()
-        assert abs(inside - 0.95) < 0.003
 
 
 # --- on a robot ---------------------------------------------------------------------------------------------------

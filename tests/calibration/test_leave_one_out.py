@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from tangent_bank import Setting, covariance, posed
+from tangent_bank import Setting, built, covariance
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -62,23 +62,12 @@ def pair() -> Chosen:
 
 @pytest.fixture(scope="module")
 def framed() -> Chosen:
-    return chosen(posed())
+    return chosen(built("posed"))
 
 
 def weighted(data: TangentData, seed: int = 0) -> TangentData:
     weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape))
     return data.with_tails(Tails(4.0, torch.from_numpy(weights)))
-
-
-# --- weights ------------------------------------------------------------------------------------------------------
-
-
-def test_clean_measurements_keep_their_weight(clean: Chosen) -> None:
-    tails = estimate_tails(clean.data, clean.scales)
-    assert tails.weights.shape == (60, 1)
-    assert tails.freedom > 8
-    assert float(tails.weights.min()) > 0.3
-    assert float(tails.weights.median()) == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("by", [5e-4, 5e-2])
@@ -95,26 +84,6 @@ def test_wrong_rows_lose_their_weight(clean: Chosen, by: float) -> None:
     assert sorted(errors.squares[:, 0].topk(4).indices.tolist()) == bad
 
 
-def test_a_wrong_marker_takes_no_other_with_it(pair: Chosen) -> None:
-    tails = estimate_tails(pair.moved(9, slice(3, 6), 2e-3), pair.scales)
-    assert tails.weights.shape == (40, 2)
-    assert float(tails.weights[9, 1]) < 0.05
-    tails.weights[9, 1] = 1.0
-    assert float(tails.weights.min()) > 0.2
-
-
-def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
-    """The frame turned by five mrad where it is."""
-    data = framed.data
-    assert data.noise_model.modes is not None
-    y = data.y.clone()
-    y[5] += data.noise_model.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
-    tails = estimate_tails(replace(data, y=y), framed.scales)
-    assert tails.weights.shape == (12, 1)
-    assert int(tails.weights.argmin()) == 5
-    assert float(tails.weights[5]) < 0.05
-
-
 def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
     data = clean.moved(3, slice(0, 3), 1e-3)
     first = estimate_tails(data, clean.scales)
@@ -122,9 +91,6 @@ def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
     again = estimate_tails(down, clean.scales)
     assert again.freedom == pytest.approx(first.freedom, rel=0.1)
     assert_close(again.weights, first.weights, rtol=0, atol=0.05)
-
-
-# --- errors under the posterior -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["pair", "framed"])
@@ -143,9 +109,6 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     actual = estimate_tails(data, case.scales, rounds=1)
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
-
-
-# --- leave one out ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
@@ -170,32 +133,11 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
         sensor = data.noise_model.rows(torch.tensor([row]))
         expected = sensor.squares(predicted[None], torch.outer(error, error)[None])
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
+    trace = float(torch.linalg.solve(total, G).trace())  # of the matrix that makes fitted values from measured ones
+    assert found.effective == pytest.approx(trace, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["clean", "pair", "framed"])
-def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
-    """The trace of the matrix that makes fitted values from measured ones."""
-    case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned().told
-    G, total = data.linearisation(case.scales).gram(), covariance(data, case.scales)
-    expected = float(torch.linalg.solve(total, G).trace())
-    assert leave_one_out(data, case.scales).effective == pytest.approx(expected, rel=1e-6)
-    assert 5 < expected < data.y.numel()
-
-
-def test_leave_one_out_judges_the_scales(clean: Chosen) -> None:
-    found = leave_one_out(clean.data, clean.scales)
-    assert 0.4 < float(found.squares.median()) / 2.37 < 2.5
-    quiet = replace(
-        clean.scales, sensor_noise=clean.scales.sensor_noise * 0.1, joint_noise=clean.scales.joint_noise * 0
-    )
-    assert float(leave_one_out(clean.data, quiet).squares.median()) > float(found.squares.median())
-
-
-# --- blocks -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (60, 3), (50, 4), (26, 7), (3, 60)])
+@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (26, 7), (3, 60)])
 def test_blocks_cover_every_row_once(coordinates: int, count: int, clean: Chosen) -> None:
     blocks = random_blocks(clean.data, 0, coordinates)
     assert len(blocks) == count
@@ -214,36 +156,14 @@ def test_several_blocks_are_predicted_one_by_one(pair: Chosen) -> None:
         assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
     assert bool(torch.isfinite(found.errors).all())
     assert found.effective is None  # that of no single fit
-    assert whole.effective is not None
     again, other = (leave_one_out(data, pair.scales, seed=seed, block_coordinates=130) for seed in (3, 4))
     assert torch.equal(again.errors, found.errors)
     assert not torch.allclose(other.errors, found.errors, rtol=1e-3, atol=0)
     assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows predict worse
 
 
-def test_outliers_are_found_in_blocks_too(clean: Chosen) -> None:
-    data = moved(clean.moved(3, slice(0, 1), 3e-2), 40, slice(1, 2), -3e-2)
-    for seed in (0, 1):
-        tails = estimate_tails(data, clean.scales, seed, block_coordinates=90)
-        assert float(tails.weights[[3, 40]].max()) < 1e-2
-        assert sorted(tails.weights[:, 0].topk(2, largest=False).indices.tolist()) == [3, 40]
-
-
 def doubled(values: Tensor) -> Tensor:
     return torch.cat([values, values])
-
-
-def test_repeats_predict_each_other(clean: Chosen) -> None:
-    """Every pose measured twice: the row that is left out is known from its repeat up to noise."""
-    data = clean.data
-    twice = replace(
-        data,
-        x=doubled(data.x),
-        y=doubled(data.y),
-        tails=Tails.none(120, 1),
-    )
-    once, again = leave_one_out(data, clean.scales), leave_one_out(twice, clean.scales)
-    assert float(again.errors.square().mean()) < 0.5 * float(once.errors.square().mean())
 
 
 def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:

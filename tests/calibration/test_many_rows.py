@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration import calibrate, choose_scales, findings
+from diffeo_calib.calibration import calibrate, choose_scales
 from diffeo_calib.calibration.identification import identification
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.identification.registration import register
@@ -99,12 +99,3 @@ def test_a_wrong_row_of_one_block_among_several_is_weighed(data: dc.Measurements
     assert whole.gross
     assert int(found.weights.argmin()) == WRONG
     assert_close(found.weights, whole.weights, rtol=0.3, atol=0)
-
-
-def test_parts_of_a_model_over_some_of_its_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = dc.calibrate(ARM.nominal, data[:SAMPLED], hyperparameters=scales(data[:SAMPLED]))
-    monkeypatch.setattr(findings, "MOST_CONFIGURATIONS", SAMPLED // 2)
-    for some, every in zip(findings.parts(result.model), result.parts, strict=True):
-        assert some.name == every.name
-        assert some.displacement == pytest.approx(every.displacement, rel=0.5, abs=1e-6)
-        assert some.displacement != every.displacement or every.displacement == 0

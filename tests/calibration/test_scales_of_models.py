@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.of_models import scales_of_models
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.process.scales import DEVIATIONS, SCALES
 from diffeo_calib.robots.dh import from_dh
@@ -76,14 +78,15 @@ def test_a_part_that_a_model_does_not_need_stays_out(first: dc.CalibrationResult
 
 def test_unusable_models_are_refused(first: dc.CalibrationResult) -> None:
     arm, data = measured(1)
-    planar = from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match=r"scales_of.*2 joints.*6 joints"):
-        dc.calibrate(planar, data, scales_of=[first.model])
-    with pytest.raises(InputError, match=r"model 2.*calibrated robot.*str"):
-        dc.calibrate(arm.nominal, data, scales_of=[first.model, "model"])  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match=r"scales_of.*list"):
-        dc.calibrate(arm.nominal, data, scales_of=first.model)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match=r"model 1 has no scales"):
-        dc.calibrate(arm.nominal, data, scales_of=[with_scales(first.model, None)])
-    with pytest.raises(InputError, match=r"hyperparameters.*scales_of"):
-        dc.calibrate(arm.nominal, data, scales_of=[first.model], hyperparameters=first.selection.scales)
+    planar, model, wrong = from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), first.model, "model"
+
+    def calibrated(scales_of: Any, robot: dc.Chain = arm.nominal, **more: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(robot, data, scales_of=scales_of, **more)
+
+    refused(
+        (r"scales_of.*2 joints.*6 joints", calibrated([model], planar)),
+        (r"model 2.*calibrated robot.*str", calibrated([model, wrong])),
+        (r"scales_of.*list", calibrated(model)),
+        (r"model 1 has no scales", calibrated([with_scales(model, None)])),
+        (r"hyperparameters.*scales_of", calibrated([model], hyperparameters=first.selection.scales)),
+    )
