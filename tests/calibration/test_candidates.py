@@ -144,8 +144,6 @@ def test_mistakes_of_trackers_and_slides() -> None:
         dc.candidates("robot", 3)  # pyright: ignore[reportArgumentType]
 
 
-# --- collisions -------------------------------------------------------------------------------------------------------
-
 LINK = """<link name="{name}"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/>
 <geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>"""
 JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>

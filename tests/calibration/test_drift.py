@@ -26,8 +26,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.writing import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.sensors.known_drift import KnownDrift
 
 ARM = SimulatedArm(seed=0)

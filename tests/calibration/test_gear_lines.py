@@ -16,11 +16,10 @@ from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, fin
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots import SimulatedArm
 
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
@@ -44,7 +43,9 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
 
 def test_planted_lines_are_found() -> None:
     data, scales = drawn()
-    found = sorted(find_gear_lines(data, scales), key=lambda line: -line.frequency)
+    lines = find_gear_lines(data, scales)
+    assert find_gear_lines(data.with_gear_lines(lines), replace(scales, lines=lines)) == ()
+    found = sorted(lines, key=lambda line: -line.frequency)
     assert [line.joint for line in found] == [joint for joint, _, _ in LINES]
     for line, (_, frequency, amplitude) in zip(found, LINES, strict=True):
         assert line.frequency == pytest.approx(frequency, abs=0.5)
@@ -53,12 +54,6 @@ def test_planted_lines_are_found() -> None:
 
 def test_no_line_where_there_is_none() -> None:
     assert [find_gear_lines(*drawn((), seed=seed)) for seed in range(3)] == [()] * 3
-
-
-def test_lines_that_were_found_are_not_found_again() -> None:
-    data, scales = drawn()
-    lines = find_gear_lines(data, scales)
-    assert find_gear_lines(data.with_gear_lines(lines), dc.Hyperparameters(**{**vars(scales), "lines": lines})) == ()
 
 
 def test_no_line_where_other_frequencies_explain_the_same() -> None:
@@ -89,20 +84,6 @@ def test_the_scan_is_that_of_least_squares() -> None:
             exact = _fall(*scan._exact(joint, torch.tensor([frequency], dtype=torch.float64)))
             assert float(exact) == pytest.approx(expected, rel=1e-6, abs=1e-6)
             assert float(falls[at]) == pytest.approx(expected, rel=0.02, abs=0.05)
-
-
-def test_the_arm_has_its_lines() -> None:
-    plain, arm = SimulatedArm(2), SimulatedArm(2, lines=[(4, 100.0, 3e-5)])
-    q = arm.sample(400, seed=1)
-    error = arm.components(q).transmission - plain.components(q).transmission
-    assert float(error[:, 4].abs().max()) == pytest.approx(3e-5, rel=1e-3)
-    assert not error[:, [0, 1, 2, 3, 5]].any()
-    turn = torch.zeros(1, 6, dtype=torch.float64)
-    turn[0, 4] = 2 * pi / 100.0
-    repeated = arm.components(q + turn).transmission - plain.components(q + turn).transmission
-    torch.testing.assert_close(repeated, error, rtol=0, atol=1e-12)
-    with pytest.raises(InputError, match="lines"):
-        SimulatedArm(2, lines=[(6, 100.0, 3e-5)])
 
 
 @pytest.mark.slow

@@ -69,12 +69,11 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     assert "may be wrong without a warning" in str(wrong.lengths[0])
 
 
-@pytest.mark.parametrize("rows", [48, 60])
-def test_sockets_without_a_known_distance_show_no_size(rows: int) -> None:
+def test_sockets_without_a_known_distance_show_no_size() -> None:
     """Neither another one nor a change: what the ball differs within a socket is no motion."""
     golden = sockets()
     table: Any = golden.rows
-    table = table.rows(slice(0, rows))
+    table = table.rows(slice(0, 48))
     table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DiffeoCalibWarning)
@@ -114,21 +113,17 @@ def test_what_a_camera_is_said_to_hold() -> None:
     assert not bool(along_u[:, 1].any())
 
 
-@pytest.mark.parametrize("step", [0.0, 1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize("step", [0.0, 1e-6, 1e-4])
 def test_the_controllers_own_positions_are_warned_about(step: float) -> None:
     q = ARM.sample(ROWS, 1)
     y = ARM.nominal(q)[:, None, :3, 3] + torch.tensor([0.5, 0.2, 0.1], dtype=torch.float64)
     y = (y / step).round() * step if step else y
-    with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
-        dc.calibrate(ARM.nominal, dc.Measurements(q, y, doubt=False), hyperparameters=scales())
-
-
-def test_the_controllers_own_poses_are_warned_about() -> None:
-    q = ARM.sample(ROWS, 1)
-    T = ARM.nominal(q)
-    T[:, :3, 3] = (T[:, :3, 3] / 1e-4).round() * 1e-4
-    with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
-        dc.calibrate(ARM.nominal, dc.Measurements.from_poses(q, T, doubt=False), hyperparameters=scales())
+    poses = ARM.nominal(q)
+    poses[:, :3, 3] = y[:, 0]
+    posed = dc.Measurements.from_poses(q, poses, doubt=False)
+    for data in (dc.Measurements(q, y, doubt=False), posed)[: 1 + (step == 1e-4)]:
+        with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
+            dc.calibrate(ARM.nominal, data, hyperparameters=scales())
 
 
 def test_rounded_positions_of_a_real_robot_are_not_refused() -> None:
@@ -143,7 +138,7 @@ def test_a_robot_without_errors_is_said_to_have_none() -> None:
         dc.calibrate(perfect.nominal, dc.Measurements(*perfect.measure(ROWS)), hyperparameters=scales())
 
 
-@pytest.mark.parametrize("lever", [10.0, 1e-3, 1e-4])
+@pytest.mark.parametrize("lever", [10.0, 1e-4])
 def test_levers_in_another_unit_are_refused(lever: float) -> None:
     q = ARM.sample(ROWS, 1)
     data = dc.Measurements.from_poses(q, ARM.truth.poses(q), lever=lever)

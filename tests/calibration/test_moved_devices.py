@@ -10,19 +10,54 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from math_bank import normal
 from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import scales
-from tangent_bank import Setting, built, covariance, normal
+from tangent_bank import Setting, built, covariance
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import opened
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence, opened
 from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, changes_of, findings
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Hypothesis
+
+# --- evidence for unknowns, against dense Gaussians and least squares -------------------------------------------------
+
+ROWS, UNKNOWNS = 12, 2
+ROOT = normal(ROWS, ROWS, seed=1)
+K = ROOT @ ROOT.mT + torch.eye(ROWS, dtype=torch.float64)
+E, R = normal(ROWS, UNKNOWNS, seed=2), 5.0 * normal(ROWS, seed=3)
+FOUND = Evidence.by(E, R, torch.linalg.cholesky(K))
+
+
+def test_sizes_are_those_of_weighted_least_squares() -> None:
+    white = torch.linalg.solve(torch.linalg.cholesky(K), torch.cat([E, R[:, None]], 1))
+    expected = torch.linalg.lstsq(white[:, :UNKNOWNS], white[:, UNKNOWNS:]).solution[:, 0]
+    left = white[:, UNKNOWNS] - white[:, :UNKNOWNS] @ expected
+    assert_close(FOUND.size, expected, rtol=1e-6, atol=0)
+    assert float(FOUND.gain) == pytest.approx(float(white[:, UNKNOWNS].square().sum() - left.square().sum()))
+    assert FOUND.excess == pytest.approx(float(left.square().mean()))
+    assert FOUND.excess > 1.0
+
+
+def test_errors_that_are_smaller_than_expected_are_no_excess() -> None:
+    assert Evidence.by(E, 1e-3 * R, torch.linalg.cholesky(K)).excess == 1.0
+
+
+@pytest.mark.parametrize("variance", [1e-3, 1.0, 1e3])
+def test_odds_are_the_ratio_of_the_densities(variance: float) -> None:
+    zero = torch.zeros(ROWS, dtype=torch.float64)
+    without, beside = (MultivariateNormal(zero, one).log_prob(R) for one in (K, K + variance * E @ E.mT))
+    (odds,) = FOUND.log_odds(torch.tensor([variance], dtype=torch.float64)).tolist()
+    assert odds == pytest.approx(float(beside - without), rel=1e-6)
+
+
+# --- changes ----------------------------------------------------------------------------------------------------------
 
 MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
 
@@ -151,7 +186,6 @@ def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) 
     after = q.clone()
     after[30:, joint] += size
     text = told(arm, q, points + arm.true_points(after) - arm.true_points(q))
-    assert text is not None
     found = re.match(rf"{arm.nominal.joint_names[joint]} seems to have changed by about ([\d.]+) mrad", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(1e3 * size, rel=0.3)
@@ -164,7 +198,6 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
     q, points = arm.measure(80, seed=1)
     ramp = torch.linspace(0, 1, 80, dtype=torch.float64)[:, None, None]
     drift = told(arm, q, points + 5e-4 * ramp * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64))
-    assert drift is not None
     found = re.match(
         r"the measuring device or the robot's base seems to drift by about ([\d.]+) mm over the rows", drift
     )
@@ -176,12 +209,10 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
 def test_a_scale_that_changes_is_seen_in_poses() -> None:
     """It moves poses apart and turns none. 2000 ppm from row 30 of 80 on."""
     arm, data, _ = simulated_poses(80)
-    assert data.poses is not None
     poses = data.poses.clone()
     middle = poses[:, :3, 3].mean(0)
     poses[30:, :3, 3] = middle + 1.002 * (poses[30:, :3, 3] - middle)
     text = said(arm.nominal, dc.Measurements.from_poses(data.q, poses))
-    assert text is not None
     found = re.match(r"the scale of the device .* changed by about ([\d.e+]+) ppm.* near row (\d+)", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(2000, rel=0.3)
@@ -195,7 +226,6 @@ def test_three_set_ups_are_no_drift() -> None:
     q, points = arm.measure(90, seed=1)
     steps = (torch.arange(90, dtype=torch.float64) // 30)[:, None, None]
     text = told(arm, q, points + 4e-4 * steps * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64), given=False)
-    assert text is not None
     found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)

@@ -119,23 +119,6 @@ def test_two_models_of_any_rows_are_compared(name: str) -> None:
     assert not found.changes.found
 
 
-def test_models_of_payloads_are_compared_under_one() -> None:
-    model = again_bank.model(again_bank.payloads)
-    found = dc.compare(model.with_payload(4.0), model.with_payload(10.0))
-    assert found.payload == 4.0
-    assert found.rms < 1e-6
-    assert str(found).startswith("with a payload of 4 no change was found")
-
-
-def test_a_recalibrated_model_keeps_its_tool() -> None:
-    tool = torch.eye(4, dtype=torch.float64)
-    tool[2, 3] = 0.1
-    model = again_bank.model(again_bank.positions).with_tool(tool, tip=ARM.nominal.tip)
-    found = dc.recalibrate(model, again_bank.positions(ARM, 12, 5)).model
-    assert torch.equal(found.tool, tool)
-    assert found.tool_tip == ARM.nominal.tip
-
-
 def test_a_recalibrated_model_keeps_its_devices() -> None:
     """Beside the robot in the new frame; what new rows see as these say: one has moved by 3 mm."""
     kind = kind_named("several kinds")
@@ -202,15 +185,6 @@ def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
     frames: Any = next(iter(found.placement))
     assert frames.names == ("before", "after")
     torch.testing.assert_close(frames.transforms[1], far, rtol=0, atol=2e-3)
-
-
-def test_a_registration_takes_sessions_and_any_payloads() -> None:
-    model, rows = again_bank.model(again_bank.positions), again_bank.sessions(ARM, 12, 5)
-    (frames,) = model.registered(rows).placement
-    assert frames.names == rows.session_names
-    laden, rows = again_bank.model(again_bank.payloads), again_bank.payloads(ARM, 12, 5)
-    registered = laden.registered(rows)
-    assert dc.evaluate(registered, again_bank.payloads(ARM, 30, 6)).rms < 2e-4
 
 
 def test_a_ball_the_model_does_not_know_is_one_more_marker() -> None:

@@ -1,7 +1,8 @@
-"""Registration: any frame and marker is found, from few poses, and undetermined directions are reported."""
+"""Registration: any frame and marker is found, from few poses; joint offsets; long chains, slides and mimic joints."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from math import pi
 from pathlib import Path
@@ -9,21 +10,25 @@ from pathlib import Path
 import pytest
 import torch
 from product_bank import ur10_measurements
+from robots_bank import draw
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.identification import registration
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.robots import Geometry, SimulatedArm, from_dh
+from diffeo_calib.calibration.identification.registration import (
+    find_joint_offsets,
+    register,
+    register_robustly,
+    with_joint_offsets,
+)
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import twist_transform
 
 ARM = SimulatedArm()
-
-
-def draw(*shape: int, seed: int = 0, size: float = 1.0) -> Tensor:
-    return size * torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def somewhere(seed: int, markers: int = 1) -> Geometry:
@@ -95,12 +100,6 @@ def test_three_poses_of_one_marker_fit_in_several_ways_and_the_status_says_so() 
     assert "only as many coordinates as unknowns" in found.status
 
 
-@pytest.mark.parametrize(("markers", "poses"), [(1, 4), (2, 3), (3, 2)])
-def test_registration_from_few_poses_predicts_them(markers: int, poses: int) -> None:
-    truth, q = somewhere(7, markers), ARM.sample(poses, 5)
-    assert register(ARM.nominal, q, truth.points(q)).rms < 1e-9
-
-
 @pytest.mark.parametrize(("markers", "poses", "need"), [(1, 2, 3), (2, 1, 2), (3, 1, 2)])
 def test_too_few_poses_are_explained(markers: int, poses: int, need: int) -> None:
     truth, q = somewhere(7, markers), ARM.sample(poses)
@@ -149,3 +148,122 @@ def test_a_ur10(ur10_folder: Path) -> None:
     train, test = data.split(0.7, seed=0)
     geometry = register(robot, train.q, train.points).geometry
     assert 1e3 * dc.evaluate(geometry.points, test).rms < 0.82
+
+
+# --- joint offsets far from the description ---------------------------------------------------------------------------
+
+OTHER = SimulatedArm(seed=3)
+
+
+@pytest.mark.parametrize(("joint", "degrees"), [(1, 10.0), (2, -25.0), (3, 12.0), (4, 45.0)])
+def test_one_joint_is_found_among_geometric_errors(joint: int, degrees: float) -> None:
+    q, points = OTHER.measure(50, seed=1)
+    wrong = q.clone()
+    wrong[:, joint] -= math.radians(degrees)
+    offsets = find_joint_offsets(register(OTHER.nominal, wrong, points).geometry, wrong, points)
+    expected = torch.zeros(6, dtype=torch.float64)
+    expected[joint] = math.radians(degrees)
+    assert_close(offsets[1:5], expected[1:5], rtol=0, atol=0.01)  # base and marker may carry the first and the last
+
+
+def test_gross_outliers_do_not_decide() -> None:
+    q, points = OTHER.measure(60, seed=1)
+    wrong, points = q.clone(), points.clone()
+    wrong[:, 2] -= 0.3
+    points[:6, 0] += torch.randn(6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    offsets = find_joint_offsets(register(OTHER.nominal, wrong[6:], points[6:]).geometry, wrong, points)
+    assert float(offsets[2]) == pytest.approx(0.3, abs=0.02)
+
+
+def test_absorbed_offsets_are_exactly_other_joint_values() -> None:
+    """Turning, sliding and mimic joints."""
+    rows = [dc.DHRow(0.1, 0.3, 0.2), dc.DHRow(0.0, 0.5, 0.1, kind="prismatic"), dc.DHRow(0.2, -0.4, 0.0)]
+    rows.append(dc.DHRow(0.3, 0.2, 0.1, mimic={"joint_1": -0.5, "joint_3": 1.0}))
+    chain = dc.from_dh(rows)
+    geometry = Geometry.nominal(chain, 2).absorb(
+        0.1 * torch.randn(Geometry.nominal(chain, 2).size, dtype=torch.float64)
+    )
+    q = torch.randn(7, chain.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    offsets = torch.tensor([0.2, -0.05, 0.4], dtype=torch.float64)
+    assert_close(with_joint_offsets(geometry, offsets).points(q), geometry.points(q + offsets), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("better", ["with", "without"])
+def test_left_out_rows_decide_on_offsets(better: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    q, points = OTHER.measure(40, seed=1)
+    q[:, 2] -= 0.3
+    data, robot = dc.Measurements(q, points), OTHER.nominal
+    if better == "with":
+        with pytest.warns(DiffeoCalibWarning, match="joint offsets are far .*: elbow_joint by 17.* degrees: got"):
+            assert register_robustly(robot, data).rms < 0.02
+    else:
+        monkeypatch.setattr(registration, "_left_out", lambda *_, with_offsets: 2.0 if with_offsets else 1.0)
+        assert register_robustly(robot, data).rms > 0.05  # and no warning
+
+
+# --- long chains ------------------------------------------------------------------------------------------------------
+
+
+def machine(moving: int, slides: tuple[int, ...] = (), *, mimic: bool = False) -> Chain:
+    """A chain of many joints with perpendicular neighbouring axes; ``mimic``: joint 4 is -(q2 + q3), as a torso's."""
+    rows = []
+    for index in range(moving):
+        kind = "prismatic" if index in slides else "revolute"
+        twist = pi / 2 if index % 2 else -pi / 2
+        follows = {"joint_2": -1.0, "joint_3": -1.0} if mimic and index == 3 else None
+        rows.append(DHRow(0.05 + 0.03 * (index % 3), twist, 0.25 - 0.02 * index, 0.1 * index, kind, follows))
+    return from_dh(rows, name=f"machine of {moving}")
+
+
+def placed(chain: Chain, deviation: float, seed: int = 3) -> Geometry:
+    """Errors of the given size in all moving joints, the base metres away, two markers."""
+    nominal = Geometry.nominal(chain, 2)
+    theta = draw(nominal.size, seed=seed, size=deviation)
+    theta[:6] = torch.tensor([1.0, -2.0, 0.5, 0.7, -0.4, 1.1])
+    theta[nominal.slices["tool"]] = draw(6, seed=seed, size=0.1)
+    return nominal.absorb(theta)
+
+
+def configurations(chain: Chain, count: int, seed: int) -> Tensor:
+    turning = torch.tensor(chain.periodic)
+    return torch.where(turning, 2.0, 0.3) * (2 * draw(count, chain.n, seed=seed).sigmoid() - 1) * 1.5
+
+
+MACHINES = [
+    machine(7, (0, 4)),
+    machine(11, (0,)),
+    machine(11, (0, 6), mimic=True),
+]
+
+
+@pytest.mark.parametrize("chain", MACHINES, ids=repr)
+def test_long_chains_are_registered_and_identified(chain: Chain) -> None:
+    truth = placed(chain, 5e-4)
+    q, test = configurations(chain, 80, seed=1), configurations(chain, 200, seed=2)
+    exact = register(replace(truth, base=torch.eye(4)), q, truth.points(q))
+    torch.testing.assert_close(exact.geometry.base, truth.base, rtol=0, atol=1e-9)
+    torch.testing.assert_close(exact.geometry.tool, truth.tool, rtol=0, atol=1e-9)
+
+    start = register(chain, q, truth.points(q))
+    found = identify(start.geometry, q, truth.points(q))
+    assert start.rms > 5e-4
+    assert found.status.startswith("converged")
+    error = (found.geometry.points(test) - truth.points(test)).norm(dim=-1)
+    assert float(error.max()) < 1e-6
+
+
+def test_the_error_of_a_mimic_joint_is_found() -> None:
+    chain = machine(11, mimic=True)
+    assert "joint_4" in repr(chain).split("mimic joints: ")[1]
+    truth = placed(chain, 0.0)
+    theta = torch.zeros(truth.size, dtype=torch.float64)
+    theta[truth.parameter_names.index("joint_4 tz [m]")] = 2e-3
+    theta[truth.parameter_names.index("joint_4 rx [rad]")] = 3e-3
+    truth = truth.absorb(theta)
+    q, test = configurations(chain, 80, seed=1), configurations(chain, 200, seed=2)
+    points = truth.points(q) + draw(80, 2, 3, seed=4, size=2e-5)
+    start = register(chain, q, points).geometry
+    found = identify(start, q, points)
+    assert found.noise == pytest.approx(2e-5, rel=0.15)
+    before, after = ((g.points(test) - truth.points(test)).norm(dim=-1) for g in (start, found.geometry))
+    assert float(after.max()) < 1e-4 < float(before.mean())

@@ -15,8 +15,8 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.process.scales import DEVIATIONS, SCALES
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import from_dh
-from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 ROWS = 16
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from product_bank import with_usual_scales
 from simulated_sockets import SocketRows, rest_in_sockets
+from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
@@ -17,7 +18,8 @@ from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import SimulatedArm
 
-DISTANCES = {("0", "1"): 0.05}
+PAIR = ("0", "1")
+DISTANCES = {PAIR: 0.05}
 
 
 @pytest.fixture(scope="module")
@@ -42,36 +44,24 @@ def test_clean_rows_pass(arm: SimulatedArm, rows: SocketRows) -> None:
     assert bool(placed.points.isfinite().all())
 
 
-def test_too_few_rows(arm: SimulatedArm, rows: SocketRows) -> None:
-    with pytest.raises(MeasurementError, match=r"at least 2 rows in every socket.*, got '2/1' in 1 row"):
-        stages_by_sockets(arm.nominal, table(rows).rows(slice(0, 31)))
-    few = table(rows, distances=None, distance_std=None).rows([0, 1, 6, 7, 12, 13])
-    with pytest.raises(MeasurementError, match="rows with sockets: expected at least 9, got 6"):
-        stages_by_sockets(arm.nominal, few)
+def test_rows_and_distances_that_cannot_be(arm: SimulatedArm, rows: SocketRows) -> None:
+    bare: Any = {"distances": None, "distance_std": None}
 
+    def staged(data: dc.Measurements) -> Callable[[], object]:
+        return lambda: stages_by_sockets(arm.nominal, data)
 
-def test_no_known_length_is_said(arm: SimulatedArm, rows: SocketRows) -> None:
-    with pytest.warns(dc.DiffeoCalibWarning, match="the size of the robot rests on its description"):
-        stages_by_sockets(arm.nominal, table(rows, distances=None, distance_std=None))
-
-
-@pytest.mark.parametrize(
-    ("distance", "message"),
-    [
-        (50.0, r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm; check the unit of `distances`"),
-        (5e-5, "check the unit of `distances`"),
-    ],
-)
-def test_distances_in_another_unit_are_refused(
-    distance: float, message: str, arm: SimulatedArm, rows: SocketRows
-) -> None:
-    with pytest.raises(MeasurementError, match=message):
-        stages_by_sockets(arm.nominal, table(rows, distances={("0", "1"): distance}))
-
-
-def test_distances_of_another_pair_are_warned_about(arm: SimulatedArm, rows: SocketRows) -> None:
-    with pytest.warns(dc.DiffeoCalibWarning, match="check between which sockets it is"):
-        stages_by_sockets(arm.nominal, table(rows, distances={("0", "1"): 0.06}))
+    refused(
+        (r"at least 2 rows in every socket.*, got '2/1' in 1 row", staged(table(rows).rows(slice(0, 31)))),
+        ("sockets: expected at least 9, got 6", staged(table(rows, **bare).rows([0, 1, 6, 7, 12, 13]))),
+        (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(rows, distances={PAIR: 50.0}))),
+        ("check the unit of `distances`", staged(table(rows, distances={PAIR: 5e-5}))),
+    )
+    for options, words in (
+        (bare, "the size of the robot rests on its description"),
+        ({"distances": {PAIR: 0.06}}, "check between which sockets it is"),
+    ):
+        with pytest.warns(dc.DiffeoCalibWarning, match=words):
+            stages_by_sockets(arm.nominal, table(rows, **options))
 
 
 def test_rows_in_a_wrong_socket_are_named(arm: SimulatedArm, rows: SocketRows) -> None:
@@ -104,33 +94,31 @@ def test_a_tool_that_never_turns_or_tilts(arm: SimulatedArm, rows: SocketRows) -
     for change, expect in ((still, pytest.raises(MeasurementError, match="the tool hardly turns")),
                            (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
         data = turned(rows, arm, change)
-        assert data.socket is not None
         with expect:
             check_registration(arm.nominal, data, register_sockets(arm.nominal, data.q, data.socket))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"names": ("0/0",)}, "`sockets`: expected 36 names, one per row, got 1"),
-        ({"names": ("0/0", " ") * 18}, r"18 row\(s\) have no name, the first is row 1"),
-        ({"distances": None}, "`distance_std` without `distances`"),
-        ({"distance_std": None}, "`distance_std`: expected a positive number in m, got None"),
-        ({"distance_std": -1.0}, "`distance_std`: expected a positive number"),
-        ({"distances": {("0", "1"): 0.0}}, "the distance of .* expected metres above 0"),
-        ({"distances": {("0", "7"): 0.1}}, r"a known distance: expected names of two sockets, got .*'0/0', '0/1'"),
-        ({"distances": {("0", "0"): 0.1}}, "a known distance: expected names of two sockets"),
-        ({"distances": {("0", "1"): 0.05, ("0/0", "0/1"): 0.06}}, "0/0 and 0/1: expected one value"),
-    ],
-)
-def test_tables_that_cannot_be_made(options: dict[str, object], message: str, rows: SocketRows) -> None:
-    with pytest.raises(MeasurementError, match=message):
-        table(rows, **options)  # pyright: ignore[reportArgumentType]
+def test_tables_that_cannot_be_made(rows: SocketRows) -> None:
+    wrong: Any = table
+    refused(
+        ("`sockets`: expected 36 names, one per row, got 1", lambda: wrong(rows, ("0/0",))),
+        (r"18 row\(s\) have no name, the first is row 1", lambda: wrong(rows, ("0/0", " ") * 18)),
+        (r"1 row\(s\) have no name", lambda: wrong(rows, [None, *rows.names[1:]])),
+        ("expected 36 names, one per row, got 'abcd'", lambda: wrong(rows, "abcd")),
+        ("expected 36 names, one per row, got 5", lambda: wrong(rows, 5)),
+        ("`distances`: expected a dictionary, got .*0.05", lambda: wrong(rows, distances=[("0", "1", 0.05)])),
+        ("`distance_std` without `distances`", lambda: wrong(rows, distances=None)),
+        ("`distance_std`: expected a positive number in m, got None", lambda: wrong(rows, distance_std=None)),
+        ("`distance_std`: expected a positive number", lambda: wrong(rows, distance_std=-1.0)),
+        ("the distance of .* expected metres above 0", lambda: wrong(rows, distances={("0", "1"): 0.0})),
+        ("expected names of two sockets, got .*'0/0', '0/1'", lambda: wrong(rows, distances={("0", "7"): 0.1})),
+        ("a known distance: expected names of two sockets", lambda: wrong(rows, distances={("0", "0"): 0.1})),
+        ("expected one value", lambda: wrong(rows, distances={("0", "1"): 0.05, ("0/0", "0/1"): 0.06})),
+    )
 
 
 def test_distances_by_name(rows: SocketRows) -> None:
-    known = table(rows, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
-    assert known is not None
+    known: Any = table(rows, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
     assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
     assert known.place_names == ("0", "1", "2")
 
@@ -161,21 +149,6 @@ def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: o
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
     with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
         check_sockets(arm.nominal, data.with_payload(2.0))
-
-
-@pytest.mark.parametrize(
-    ("names", "distances", "message"),
-    [
-        (5, None, "`sockets`: expected 4 names, one per row, got 5"),
-        ("abcd", None, "`sockets`: expected 4 names, one per row, got 'abcd'"),
-        (["a/0", None, "a/1", float("nan")], None, r"2 row\(s\) have no name, the first is row 1"),
-        (["a/0", "a/1"] * 2, [("0", "1", 0.05)], "`distances`: expected a dictionary, got .*0.05"),
-    ],
-)
-def test_names_and_distances_of_another_kind(names: Any, distances: Any, message: str) -> None:
-    q = torch.zeros(4, 2, dtype=torch.float64)
-    with pytest.raises(MeasurementError, match=message):
-        dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-5, doubt=False)
 
 
 def test_rows_in_sockets_are_shown_and_joined() -> None:

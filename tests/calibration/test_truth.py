@@ -18,7 +18,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 

@@ -9,12 +9,12 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, usual_scales, with_usual_scales
+from product_bank import Case, simulated, with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots import Geometry
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 
@@ -79,28 +79,18 @@ def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
     return arm.nominal, train.q, arm.true_points(train.q) + std[:, None, None] * draw, std, test
 
 
-@pytest.fixture(scope="module")
-def given() -> dc.CalibrationResult:
-    """The mixed rows with their known deviations."""
-    robot, q, points, std, _ = mixed()
-    return dc.calibrate(robot, dc.Measurements(q, points, std=std), hyperparameters=usual_scales(robot))
-
-
-def test_known_deviations_weigh_the_rows(given: dc.CalibrationResult) -> None:
-    robot, q, points, _, test = mixed()
+def test_known_deviations_weigh_the_rows() -> None:
+    """Rows that are known to be bad do no harm."""
+    robot, q, points, std, test = mixed()
+    given = with_usual_scales(robot, dc.Measurements(q, points, std=std))
     unknown = dc.calibrate(robot, dc.Measurements(q, points))
     assert held_out(given, test) < 0.8 * held_out(unknown, test)
+    good = with_usual_scales(robot, dc.Measurements(q[1::2], points[1::2]))
+    assert held_out(given, test) < 1.1 * held_out(good, test)
     assert given.outliers == []
     noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2).mean(1).sqrt()
     assert float(noise[::2].min()) > 0.9e-3
     assert float(noise[1::2].max()) < 2e-4
-
-
-def test_rows_that_are_known_to_be_bad_do_no_harm(given: dc.CalibrationResult) -> None:
-    robot, q, points, _, test = mixed()
-    scales = given.selection.scales
-    good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]), hyperparameters=scales)
-    assert held_out(given, test) < 1.1 * held_out(good, test)
 
 
 def test_known_deviations_that_are_too_small_leave_the_rest_to_be_estimated(arm: Case) -> None:
@@ -164,7 +154,7 @@ def random_measurements(robot: dc.Chain, rows: int, seed: int) -> dc.Measurement
 
 @pytest.mark.parametrize(
     ("joints", "rows", "gain"),
-    [(11, 60, 0.5), (3, 40, 0.9)],
+    [(11, 60, 0.5), (3, 40, 0.9), (1, 20, 1.0)],
 )
 def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     robot = random_chain(joints)
@@ -174,12 +164,6 @@ def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     assert len(result.parts) == joints + 5
     geometry = dc.evaluate(result.identification.geometry.points, test).rms
     assert held_out(result, test) < gain * geometry
-
-
-def test_a_single_joint() -> None:
-    robot = random_chain(1)
-    result = dc.calibrate(robot, random_measurements(robot, 20, 1))
-    assert held_out(result, random_measurements(robot, 100, 5)) < 6e-5
 
 
 def test_fewer_control_points_give_the_same_model(arm: Case) -> None:

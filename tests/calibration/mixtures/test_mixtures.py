@@ -23,8 +23,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
 CHI2_3 = 7.815
