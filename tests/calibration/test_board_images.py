@@ -12,6 +12,7 @@ import torch
 from golden_bank import camera_on_tool
 from kind_bank import rigid_rms
 from simulated_camera import HEIGHT, WIDTH, CameraArm, camera_arm, fixed_camera_arm, true_camera
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -70,7 +71,6 @@ def test_lens_and_board_are_found_with_the_robot() -> None:
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
-    assert before is not None
     assert bool((deviations <= 1.001 * before.deviations).all())  # rows of the robot can only add
     assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
 
@@ -88,8 +88,7 @@ def test_a_fixed_camera_sees_the_board_on_the_tool() -> None:
 
 
 def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     mirrored = corners.clone()
     mirrored[..., 0] *= -1
     found = dc.calibrate(arm().arm.nominal, of_corners(mirrored), hyperparameters=SCALES)
@@ -98,8 +97,7 @@ def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
 
 @pytest.mark.parametrize("factor", [0.97, 1.04])
 def test_a_board_of_another_size_is_warned_about(factor: float) -> None:
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     wrong = corners.clone()
     wrong[..., :3] *= factor
     percent = "smaller" if factor < 1 else "larger"
@@ -108,8 +106,7 @@ def test_a_board_of_another_size_is_warned_about(factor: float) -> None:
 
 
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     wrong = corners.clone()
     wrong[..., :3] *= 0.988
     with warnings.catch_warnings(record=True) as caught:
@@ -120,25 +117,28 @@ def test_a_board_of_nearly_the_right_size_is_named() -> None:
     assert not any(line.startswith("not decided") for line in calibrated().placement.sentences())
 
 
-def test_images_in_another_order_are_refused() -> None:
-    corners = data().corners
-    assert corners is not None
-    with pytest.raises(MeasurementError, match="row"):
-        dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))
+def test_tables_that_cannot_be() -> None:
+    corners: Any = data().corners
+    small = replace(true_camera(), half_size=0.0, width=640, height=480)
+    refused(
+        ("row", lambda: dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))),
+        ("640 x 480", lambda: of_corners(corners, camera=small)),
+        ("640 x 480", lambda: dc.Measurements.from_images(data().q, corners, (640, 480))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35, 4))),
+    )
 
 
 def test_joints_that_still_moved_are_warned_about() -> None:
     q = data().q.clone()
     q[1:] = 0.9 * data().q[1:] + 0.1 * data().q[:-1]
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit this robot"):
         place(arm().arm.nominal, of_corners(corners, q), silent)
 
 
 def test_the_lens_of_another_camera_is_refused() -> None:
     corners, camera = data().corners, true_camera()
-    assert corners is not None
     other = camera.unknowns.clone()
     known = replace(camera, half_size=0.0)
     of_corners(corners, camera=known)
@@ -148,27 +148,6 @@ def test_the_lens_of_another_camera_is_refused() -> None:
     other[:2] *= 1.5
     with pytest.raises(MeasurementError, match=r"with the given camera.*1890"):
         of_corners(corners, camera=replace(known, unknowns=other))
-
-
-def test_a_camera_of_another_image_size_is_refused() -> None:
-    corners = data().corners
-    assert corners is not None
-    known = replace(true_camera(), half_size=0.0, width=640, height=480)
-    with pytest.raises(MeasurementError, match="640 x 480"):
-        of_corners(corners, camera=known)
-
-
-def test_resized_images_are_refused_by_their_corners() -> None:
-    corners = data().corners
-    assert corners is not None
-    with pytest.raises(MeasurementError, match="640 x 480"):
-        dc.Measurements.from_images(data().q, corners, (640, 480))
-
-
-@pytest.mark.parametrize("shape", [(60, 35), (60, 35, 4)])
-def test_corners_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(MeasurementError, match=r"corners.*\(N, K, 5\)"):
-        of_corners(torch.zeros(shape))
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

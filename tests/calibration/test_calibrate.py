@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -41,20 +42,6 @@ def test_the_stages_improve_in_order(arm: Case) -> None:
     sound(arm)
 
 
-@pytest.mark.slow
-def test_the_stages_improve_in_order_with_200_poses(arm_200: Case) -> None:
-    registration, geometry, diffeomorphic = arm_200.held_out()
-    assert geometry < 0.5 * registration
-    assert diffeomorphic < 0.1 * geometry
-    assert diffeomorphic < 0.045e-3
-    sound(arm_200)
-
-
-@pytest.mark.slow
-def test_more_poses_are_better(arm: Case, arm_200: Case) -> None:
-    assert arm_200.held_out()[2] < 0.9 * arm.held_out()[2]
-
-
 def test_the_refined_geometry_is_part_of_the_model(arm: Case) -> None:
     """The joint fit refines the geometry; the model must hold those refinements, not only its own copy of k0."""
     theta = arm.model.map.deformation.momenta.theta
@@ -71,7 +58,6 @@ def test_the_refined_geometry_is_part_of_the_model(arm: Case) -> None:
 
 def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
     summary, result = arm.model.summary, arm.result
-    assert summary is not None
     stages = (summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms)
     assert stages == pytest.approx([dc.evaluate(stage, arm.train).rms for stage in result.stages.values()], rel=1e-9)
     left_out = result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
@@ -86,19 +72,9 @@ def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
     assert (summary.energy, summary.status) == (fit.energy, fit.status)
 
 
-def test_the_report_names_the_summary_with_its_units(arm: Case) -> None:
-    report, summary = arm.model.report, arm.model.summary
-    assert summary is not None
-    assert report["diffeomorphic rms [m]"] == summary.diffeomorphic_rms
-    assert report["rows"] == 60
-    assert report["gravity on joints [m]"] == summary.parts["gravity on joints"]
-    assert dc.CalibratedKinematics(arm.robot, arm.model.map).report == {}
-
-
 @pytest.mark.slow
 def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, slider: Case) -> None:
     for case in (arm, pair, slider):
-        assert case.model.summary is not None
         left_out = case.model.summary.leave_one_out_rms
         assert left_out / math.sqrt(case.train.markers) == pytest.approx(case.held_out()[2], rel=0.4)
         assert dc.evaluate(case.model, case.train).rms < left_out
@@ -171,7 +147,7 @@ def test_a_prismatic_joint(slider: Case) -> None:
 class Watched:
     """A calibration with twelve poses, and the progress that it reported."""
 
-    result: dc.CalibrationResult
+    result: Any
     steps: list[tuple[str, int, int]]
 
 

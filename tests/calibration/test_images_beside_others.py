@@ -81,12 +81,6 @@ def test_socket_and_ball_are_found_from_poses_of_the_tool() -> None:
 # --- a tracker beside images ----------------------------------------------------------------------------------------
 
 
-def test_positions_beside_images_are_readings_of_the_same_tool() -> None:
-    whole = kind().source.golden.rows
-    assert [part.kind for part in whole.parts] == ["pose", "marker"]
-    assert set(whole.parts[1].device_names) == {"tracker"}
-
-
 def test_the_size_comes_from_board_and_tracker() -> None:
     truth, own = camera_arm(60).camera, camera()
     assert float(own.deviations[SCALE]) < 0.4 * BOARD_PRIOR.scale
@@ -111,13 +105,6 @@ def test_the_tracker_makes_the_workspace_known() -> None:
     q = kind().source.golden.rows.parts[1].q
     truth = kind().source.truth(q)
     assert rigid_rms(kind().model(q).detach(), truth) < 0.5 * rigid_rms(alone.model(q).detach(), truth)
-
-
-def test_the_tracker_alone_is_judged() -> None:
-    marker: Any = kind().new.parts[1]
-    found: Any = dc.evaluate(kind().model, marker)
-    assert (found.count, found.unit) == (len(marker), "m")
-    assert found.rms < 2e-4
 
 
 def test_no_row_is_said_to_be_of_another_set_up() -> None:

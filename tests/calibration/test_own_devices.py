@@ -18,7 +18,6 @@ from product_bank import simulated_poses
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -129,21 +128,6 @@ def test_a_frame_is_seen_beside_poses_only() -> None:
             dc.calibrate(arm.nominal, rows)  # pyright: ignore
     with pytest.raises(InputError, match="poses"):
         dc.evaluate(kind_named("positions").model, seen)
-
-
-def test_poses_are_planned_for_it(arm: SimulatedArm, result: Any) -> None:
-    """A fixed point has as many unknowns; slopes tell them apart."""
-    sensors = sensor_of(result.model)
-    beams: Any = sensors[1:]
-    assert [type(one.devices) for one in beams] == [Beams, Beams]
-    known = result.readings[0].devices.constants
-    for own in (one.devices.constants[0] for one in beams):
-        alike = torch.linalg.cross(known[:, 3:], own[3:].expand(2, 3)).norm(dim=1)
-        assert float(alike.min()) < 1e-3
-        point, direction = known[int(alike.argmin())].split(3)
-        assert float(torch.linalg.cross(own[:3] - point, direction, dim=0).norm()) < 3e-3
-    plan = dc.plan(result.model, arm.sample(40, seed=3), 3)
-    assert float(plan.expected_rms[-1]) < float(plan.expected_rms[0])
 
 
 def test_written_and_read_in_its_own_unit(arm: SimulatedArm, tmp_path: Path) -> None:

@@ -194,8 +194,6 @@ def test_rows_outside_of_the_old_range_say_nothing_about_change(arm: Case) -> No
 
 # --- rows that an old model must not be made to fit -------------------------------------------------------------------
 
-pytestmark = pytest.mark.slow
-
 
 def noisy(data: dc.Measurements, metres: float, std: float | None = None) -> dc.Measurements:
     generator = torch.Generator().manual_seed(3)

@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
+import re
+import warnings
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from mixture_bank import TRACKED
-from simulated_sockets import SocketRows
+from mixture_bank import DISTANCES, TRACKED
+from reading_bank import scales as usual
+from simulated_sockets import SocketRows, rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    """Marker 0 is the ball; the tracker sees marker 1."""
+    return SimulatedArm(seed=3, markers=2)
+
+
+@pytest.fixture(scope="module")
+def rows(arm: SimulatedArm) -> SocketRows:
+    return rest_in_sockets(arm, seed=3, places=4, rows=8)
+
+
+@pytest.fixture(scope="module")
+def resting(rows: SocketRows, arm: SimulatedArm) -> dc.Measurements:
+    names = arm.nominal.joint_names
+    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
+
+
+@pytest.fixture(scope="module")
+def tracked(arm: SimulatedArm) -> dc.Measurements:
+    q, points = arm.measure(TRACKED + 20, seed=5)
+    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
+
+
+@pytest.fixture(scope="module")
+def mixture(tracked: dc.Measurements, resting: dc.Measurements) -> dc.Measurements:
+    return dc.Measurements.joined([tracked.rows(slice(TRACKED)), resting])
+
 
 CHI2_3 = 7.815
 
@@ -36,7 +70,7 @@ def scales(arm: SimulatedArm, tracked: dc.Measurements) -> dc.Hyperparameters:
 
 
 @pytest.fixture(scope="module")
-def result(arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters) -> dc.CalibrationResult:
+def result(arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters) -> Any:
     return dc.calibrate(arm.nominal, mixture, hyperparameters=scales)
 
 
@@ -51,11 +85,7 @@ def rms(errors: Tensor) -> float:
 
 
 def test_better_than_either_half(
-    arm: SimulatedArm,
-    result: dc.CalibrationResult,
-    scales: dc.Hyperparameters,
-    tracked: dc.Measurements,
-    resting: dc.Measurements,
+    arm: SimulatedArm, result: Any, scales: dc.Hyperparameters, tracked: dc.Measurements, resting: dc.Measurements
 ) -> None:
     """In the tracker's frame, where the sockets alone know no frame at all; as accurate as predicted."""
     q = arm.sample(400, seed=9)
@@ -73,11 +103,8 @@ def test_better_than_either_half(
     assert result.fit.converged
 
 
-def test_the_sockets_are_in_the_frame_of_the_device(
-    arm: SimulatedArm, result: dc.CalibrationResult, rows: SocketRows
-) -> None:
+def test_the_sockets_are_in_the_frame_of_the_device(arm: SimulatedArm, result: Any, rows: SocketRows) -> None:
     found, base = result.sockets, arm.truth.base
-    assert found is not None
     assert found.by_device
     truth = torch.stack([rows.positions[name] for name in found.names]) @ base[:3, :3].mT + base[:3, 3]
     errors = (found.positions - truth).flatten()
@@ -89,7 +116,7 @@ def test_the_sockets_are_in_the_frame_of_the_device(
 
 
 def test_equivariance_under_motions_of_the_device(
-    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: dc.CalibrationResult
+    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
 ) -> None:
     """Another frame of the tracker is another frame of everything that was found."""
     T = twist_transform(torch.tensor([0.4, -0.2, 0.9, 0.3, 1.1, -0.5], dtype=torch.float64))
@@ -97,8 +124,6 @@ def test_equivariance_under_motions_of_the_device(
     first, second = result, dc.calibrate(arm.nominal, moved, hyperparameters=scales)
     q = arm.sample(20, seed=1)
     torch.testing.assert_close(second.model(q), first.model(q) @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
-    assert first.sockets is not None
-    assert second.sockets is not None
     places = first.sockets.positions @ T[:3, :3].mT + T[:3, 3]
     torch.testing.assert_close(second.sockets.positions, places, rtol=0, atol=2e-6)
 
@@ -107,10 +132,7 @@ def test_the_posterior_of_independent_equations(tangent: TangentData) -> None:
     """The regression with hidden coordinates and shared shifts, against one of the measured coordinates alone."""
     data, scales = tangent, defaults(tangent, 3e-4, Prior())
     kinds, shared = data.noise_model.row_kinds, data.shared
-    assert kinds is not None
-    assert shared is not None
     resting = kinds == 1
-    assert scales.other_noise is not None
     assert not bool(shared[~resting].any()), "no position that was measured shares a shift"
     assert not bool(shared[:, :3].any())
     assert bool(shared[resting][:, 3:].any(2).all())
@@ -129,30 +151,21 @@ def test_the_posterior_of_independent_equations(tangent: TangentData) -> None:
     assert float((found - mu).norm() / mu.norm()) < 1e-6
 
 
-def test_the_device_holds_the_frame(tangent: TangentData) -> None:
-    """Nothing has to be fixed: base and first joint are found with everything else."""
-    assert bool(tangent.theta[:12].all())
-
-
 def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
     """One more scale, whose slope is that of the log posterior."""
     centre = defaults(tangent, 3e-4, Prior())
     point, step = centre.logarithms() + 0.1, 1e-4
     assert len(point) == len(replace(centre, other_noise=None).logarithms()) + 1
     found = log_posterior(point, centre, tangent)
-    assert found is not None
     values = []
     for sign in (-1.0, 1.0):
         moved = point.clone()
         moved[-1] += sign * step
         there = log_posterior(moved, centre, tangent)
-        assert there is not None
         values.append(there.likelihood + there.prior)
     assert abs(float(found.gradient[-1])) > 1.0
     assert float(found.gradient[-1]) == pytest.approx((values[1] - values[0]) / (2 * step), rel=1e-5)
     wider = centre.inflated(2.0).other_noise
-    assert wider is not None
-    assert centre.other_noise is not None
     assert float(wider) == 2.0 * float(centre.other_noise)
 
 
@@ -161,8 +174,6 @@ def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
 ) -> None:
     """Places that contradict each other widen the deviations as by themselves, but no more for being few."""
     places, socket, groups = mixture.places, mixture.socket, mixture.groups()
-    assert places is not None
-    assert socket is not None
     assert len(places.unique()) == 4 + 1, "one number for all tracked rows"
     wide = defaults(tangent, 1e-2, Prior())
     assert inflation_by_places(tangent, wide, places, socket, groups) == region_factor(4 + TRACKED, 3)
@@ -177,7 +188,6 @@ def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
 
 def test_a_known_base_is_kept(arm: SimulatedArm, resting: dc.Measurements) -> None:
     """The ball is the same in every frame, the sockets move with it."""
-    assert resting.socket is not None
     bare = register_sockets(arm.nominal, resting.q, resting.socket)
     T = arm.truth.base
     placed = replace(Geometry.nominal(arm.nominal), base=T)
@@ -187,7 +197,7 @@ def test_a_known_base_is_kept(arm: SimulatedArm, resting: dc.Measurements) -> No
 
 
 def test_evaluation_of_each_kind(
-    result: dc.CalibrationResult, tracked: dc.Measurements, resting: dc.Measurements, mixture: dc.Measurements
+    result: Any, tracked: dc.Measurements, resting: dc.Measurements, mixture: dc.Measurements
 ) -> None:
     new = tracked.rows(slice(TRACKED, None))
     positions = dc.evaluate(result.model, new)
@@ -201,7 +211,6 @@ def test_evaluation_of_each_kind(
     errors = [one.error for one in spread.distances]
     assert [one.error for one in both["socket"].distances] == pytest.approx(errors, abs=1e-12)
     assert len(both["socket"].distances) == 4
-    assert result.model.summary is not None
     left_out = result.leave_one_out.errors
     assert result.left_out_rms == pytest.approx(rms(left_out[:TRACKED, :3]), rel=1e-9)
     assert result.left_out["socket"].rms == pytest.approx(rms(left_out[TRACKED:, 3:]), rel=1e-9)
@@ -209,7 +218,7 @@ def test_evaluation_of_each_kind(
 
 
 def test_several_set_ups_of_the_device(
-    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: dc.CalibrationResult
+    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
 ) -> None:
     """Rows in sockets belong to no set-up, and the places of the robot to all."""
     T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
@@ -219,40 +228,94 @@ def test_several_set_ups_of_the_device(
     moved = with_attributes(device, points=points).with_sessions(["ab"[int(flag)] for flag in second])
     both = dc.Measurements.joined([moved, resting])
     found = dc.calibrate(arm.nominal, both, hyperparameters=scales)
-    assert found.sessions is not None
     torch.testing.assert_close(found.sessions.transforms[1], T, rtol=0, atol=5e-4)
     q = arm.sample(100, seed=2)
     assert rms(found.model(q) - arm.true_points(q).flip(1)) < 1.5 * rms(result.model(q) - arm.true_points(q).flip(1))
 
 
-def test_a_moved_device_moves_no_ball(tangent: TangentData) -> None:
-    device, _, marker = (one.effects for one in changes_of(tangent)[:3])
-    ball = tangent.visible[:, 3:]
-    assert not bool(device[:, 3:][ball].any())
-    assert bool(device[:, :3].any())
-    assert bool(marker[:, 3:].any())
+# --- tables of both ---------------------------------------------------------------------------------------------------
 
 
-def test_samples_of_few_poses_hold_both_kinds(tangent: TangentData) -> None:
-    for poses, drawn in ((30, 15), (80, TRACKED)):
-        assert int((tangent.sample(poses, 10_000, seed=0)[0] < TRACKED).sum()) == drawn
+def test_splits_hold_out_measured_positions(mixture: dc.Measurements) -> None:
+    train, test = mixture.split(0.6, seed=1)
+    assert bool((test.places < 0).all())
+    assert (len(test), int((train.places >= 0).sum())) == (10, 64)
+    held = torch.cat([part.line_numbers for _, part in mixture.folds(5)])
+    assert torch.equal(held.sort().values, torch.arange(TRACKED))
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_what_needs_measured_positions_alone(
-    result: dc.CalibrationResult,
-    mixture: dc.Measurements,
+def test_joined_and_taken_apart(mixture: dc.Measurements, tracked: dc.Measurements, resting: dc.Measurements) -> None:
+    assert not mixture.without_device
+    assert mixture.device_rows().sha256 == tracked.rows(slice(TRACKED)).sha256
+    assert mixture.socket_rows().sha256 == resting.sha256
+    assert torch.equal(mixture.visible.sum(0), torch.tensor([TRACKED, len(resting)]))
+    assert mixture.sha256 != dc.Measurements.joined([tracked.rows(slice(1, TRACKED + 1)), resting]).sha256
+    assert "2 markers, the last one in 8 sockets in 64 of the rows" in repr(mixture)
+    frame = mixture.to_frame()
+    assert list(frame.columns[6:]) == ["socket", "x", "y", "z"]
+    assert frame["socket"].iloc[0] == ""
+    assert frame["x"].isna().sum() == len(resting)
+    again = dc.Measurements.joined([mixture, tracked.rows(slice(TRACKED, None))])
+    assert (len(again), again.markers) == (TRACKED + 84, 2)
+
+
+def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
+    """The same as if they had been joined at once, in any order; rows in other sockets are named."""
+    some = resting.rows(slice(10))
+    for parts, places in (([mixture, some], slice(-10, None)), ([some, mixture], slice(10))):
+        both = dc.Measurements.joined(parts)
+        assert both.visible[places].tolist() == [[False, True]] * 10
+        assert torch.equal(both.socket[places], some.socket)  # pyright: ignore[reportArgumentType]
+        assert len(both.device_rows()) == TRACKED
+    marked = dc.Measurements.joined([mixture.device_rows().with_sessions(["day"] * TRACKED), resting])
+    whole = dc.Measurements.joined([marked, some])
+    assert whole.session[-10:].tolist() == [-1] * 10
+    other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
+    with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
+        dc.Measurements.joined([mixture, other])
+
+
+def test_a_distance_that_contradicts_the_device(arm: SimulatedArm, rows: SocketRows, tracked: dc.Measurements) -> None:
+    def known(distance: float) -> dc.Measurements:
+        names, given = arm.nominal.joint_names, {("0", "1"): distance}
+        resting = dc.Measurements.from_sockets(rows.q, rows.names, names, distances=given, distance_std=1e-5)
+        return dc.Measurements.joined([tracked, resting])
+
+    given = replace(usual(), other_noise=torch.tensor([2e-5], dtype=torch.float64))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dc.calibrate(arm.nominal, known(0.051), hyperparameters=given)
+    (text,) = [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+    assert re.match(r"the distance of .*\(51.00 mm\) seems to differ by \+(0.9|1)", text), text
+    with pytest.raises(MeasurementError, match="check the unit of `distances`"):
+        stages_by_sockets(arm.nominal, known(50.0))
+
+
+def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
+    bend = torch.zeros(6, dtype=torch.float64)
+    bend[4] = 0.05
+    other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
+    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
+        stages_by_sockets(arm.nominal, dc.Measurements.joined([tracked, other]))
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (lambda t, s: [t.rows([0, 1]), s], "9 unknowns .* expected at least 3 poses"),
+        (lambda t, s: [t, s.rows(slice(0, 9))], r"at least 2 rows in every socket.*, got '0/1' in 1 row"),
+        (lambda t, s: [with_attributes(t, points=1e3 * t.points), s], "positions seem to be 1000 times too large"),
+        (lambda t, s: [t.with_payload(1.0), s.with_payload(0.0)], "rows with sockets: expected no payloads"),
+        (lambda t, s: [t.with_payload(1.0), s], "the tables differ in payload"),
+        (lambda t, s: [t, s.with_joint_names([f"q{k}" for k in range(6)])], "the tables differ in joint_names"),
+    ],
+)  # fmt: skip
+def test_refused(
+    use: Callable[..., list[dc.Measurements]],
+    message: str,
+    arm: SimulatedArm,
     tracked: dc.Measurements,
     resting: dc.Measurements,
-    tmp_path: Path,
 ) -> None:
-    poses = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
-    posed = dc.Measurements.from_poses(tracked.q[:6], poses, tracked.joint_names, doubt=False)
-    assert isinstance(dc.Measurements.joined([posed, resting]), dc.Observations)
-    with pytest.raises(MeasurementError, match="the rows have no sockets"):
-        tracked.socket_rows()
-    new = tracked.rows(slice(TRACKED, None))
-    seen = result.model.registered(new.rows(slice(8)))
-    assert dc.evaluate(seen, new.rows(slice(8, None))).rms < 3e-4
-    assert seen.ball  # it stayed on the tool
-    dc.write_report(seen, tmp_path / "page.html", new.rows(slice(8)))
+    with pytest.raises(MeasurementError, match=message):
+        stages_by_sockets(arm.nominal, dc.Measurements.joined(use(tracked, resting)))
