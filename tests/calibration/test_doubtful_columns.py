@@ -180,12 +180,15 @@ def marker_of(data: dc.Measurements) -> tuple[str, str] | None:
 
 
 def test_several_markers_are_told_by_their_column(tmp_path: Path) -> None:
-    found = marker_of(labelled(tmp_path / "t.csv", POINTS[torch.arange(ROWS), LABELS], LABELS))
+    data = labelled(tmp_path / "t.csv", POINTS[torch.arange(ROWS), LABELS], LABELS)
+    found: Any = marker_of(data)
     assert found[0] == "target"
     tool = ARM.truth.tool
     jump = 1e3 * float(torch.cdist(tool, tool).max())
     assert found[1].startswith("3 values between which the points jump by")
     assert abs(float(found[1].split("jump by ")[1].split(" mm")[0]) / jump - 1.0) < 0.1
+    with pytest.raises(MeasurementError, match=r"column 'target' takes 3 values.* name the column: --marker target"):
+        check_identification(data, register(ARM.nominal, data.q, data.points))
 
 
 @pytest.mark.parametrize("case", ["no jump", "other labels", "device", "mass", "repeated poses"])
@@ -203,12 +206,6 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
         q, labels = Q[:9].repeat(5, 1), torch.arange(9).repeat(5)
         points = ARM.true_points(q)[:, 0]
     assert marker_of(labelled(tmp_path / "t.csv", points, labels, q)) is None
-
-
-def test_rows_of_several_markers_are_no_fit(tmp_path: Path) -> None:
-    data = labelled(tmp_path / "t.csv", POINTS[torch.arange(ROWS), LABELS], LABELS)
-    with pytest.raises(MeasurementError, match=r"column 'target' takes 3 values.* name the column: --marker target"):
-        check_identification(data, register(ARM.nominal, data.q, data.points))
 
 
 # --- markers that nobody measured -------------------------------------------------------------------------------------

@@ -1,14 +1,18 @@
-"""Markers that are hidden in some rows: the same results as a second implementation that drops their coordinates."""
+"""Hidden markers: the same as a second implementation that drops their coordinates, and from table to report."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from math import log, nan, pi
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from command_bank import leave_undrawn
 from tangent_bank import Setting, noise_covariance, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -26,6 +30,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.robots import SimulatedArm
 
 MARKERS, ROWS = 3, 24
@@ -212,3 +217,98 @@ def test_marker_that_no_row_shows_is_refused() -> None:
         dc.calibrate(arm.nominal, data.rows(slice(10, None)))
     with pytest.raises(MeasurementError, match="never show marker 1"):
         register(arm.nominal, q[10:], points[10:])
+
+
+# --- from the table to the report -------------------------------------------------------------------------------------
+
+COUNT, WRONG_ROW = 40, 7
+INSIDE_95 = 7.8147
+
+
+def three_markers(*, worn: float = 1.0) -> SimulatedArm:
+    return SimulatedArm(seed=0, markers=3).worn(2, worn)
+
+
+def with_gaps(data: dc.Measurements, seed: int, share: float = 0.3) -> dc.Measurements:
+    """The same rows without some markers."""
+    gone = torch.rand(data.points.shape[:2], generator=torch.Generator().manual_seed(seed)) < share
+    gone[gone.all(1), 0] = False
+    return dc.Measurements(data.q, data.points.masked_fill(gone[..., None], nan), data.joint_names)
+
+
+def rows(count: int, seed: int, robot: SimulatedArm | None = None) -> dc.Measurements:
+    robot = robot or three_markers()
+    return dc.Measurements(*robot.measure(count, seed=seed), robot.nominal.joint_names)
+
+
+@pytest.fixture(scope="module")
+def some() -> dc.Measurements:
+    """Rows with gaps, one of them with a wrong marker beside a hidden one."""
+    data = with_gaps(rows(COUNT, 1), 0)
+    points = data.points.clone()
+    points[WRONG_ROW] = rows(COUNT, 1).points[WRONG_ROW]
+    points[WRONG_ROW, 0], points[WRONG_ROW, 2, 1] = nan, points[WRONG_ROW, 2, 1] + 2e-3
+    return dc.Measurements(data.q, points, data.joint_names)
+
+
+@pytest.fixture(scope="module")
+def result(some: dc.Measurements) -> Any:
+    return dc.calibrate(three_markers().nominal, some)
+
+
+def squares(model: dc.CalibratedKinematics, test: dc.Measurements) -> Tensor:
+    mean, covariance = model.predict(test.q)
+    away = (test.points - mean)[..., None]
+    return (away.mT @ torch.linalg.solve(covariance, away)).flatten()
+
+
+@pytest.mark.slow
+def test_calibration_with_gaps_is_nearly_as_good_as_without(some: dc.Measurements, result: Any) -> None:
+    test = rows(100, 9)
+    errors = {"hidden": dc.evaluate(result.model, test).rms}
+    scales = result.selection.scales
+    for name, given in (("all", rows(COUNT, 1)), ("whole rows", some.rows(some.visible.all(1)))):
+        errors[name] = dc.evaluate(dc.calibrate(three_markers().nominal, given, hyperparameters=scales).model, test).rms
+    assert errors["hidden"] < 1.3 * errors["all"] < 0.5 * errors["whole rows"]
+    assert float((squares(result.model, test) < INSIDE_95).double().mean()) > 0.93
+
+
+@pytest.mark.slow
+def test_only_the_wrong_marker_loses_its_weight(result: Any) -> None:
+    (found,) = result.outliers
+    assert (found.row, found.marker) == (WRONG_ROW, 2)
+    assert "marker 2 alone is off" in found.reason
+    weights = result.tails.weights[WRONG_ROW]
+    assert float(weights[2]) < 0.1 < float(weights[1])
+    assert float(weights[0]) == 1.0
+
+
+@pytest.mark.slow
+def test_errors_are_those_of_what_was_seen(some: dc.Measurements, result: Any) -> None:
+    found = dc.evaluate(result.model, some)
+    distances = (some.points - result.model(some.q).detach()).norm(dim=-1)
+    seen = distances[some.visible]
+    assert_close(found.errors[some.visible], seen, rtol=1e-12, atol=0)
+    assert bool(found.errors[~some.visible].isnan().all())
+    assert found.rms == pytest.approx(float(seen.square().mean().sqrt()), rel=1e-12)
+    assert found.median == pytest.approx(float(seen.quantile(0.5)), rel=1e-12)
+    assert found.max == float(seen.max())
+    assert f"({len(seen)} distances" in repr(found)
+
+
+@pytest.mark.slow
+def test_model_file_knows_what_was_hidden(
+    some: dc.Measurements, result: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dc.save(result.model, tmp_path / "model.safetensors")
+    loaded = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    fit_rows = FitRows(loaded)
+    assert_close(fit_rows.points, some.points, rtol=0, atol=1e-8, equal_nan=True)
+    predictions = Predictions.of_fit(fit_rows)
+    assert bool((predictions.squares.isnan() == ~some.visible).all())
+    assert 0.9 < predictions.coverage() <= 1.0
+    leave_undrawn(monkeypatch)
+    for name, rows_of in (("report.html", (with_gaps(rows(20, 5), 2),)), ("fit.html", ())):
+        dc.write_report(loaded, tmp_path / name, *rows_of)
+        assert not re.search("NaN|>nan", (tmp_path / name).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Measured positions and rows in sockets in one table: accuracy, the frame of the device, and what is refused."""
+"""Tables of several kinds, and positions beside rows in sockets: accuracy, frames, devices, and what is refused."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import Any
 import pytest
 import torch
 from mixture_bank import DISTANCES, TRACKED
+from reading_bank import POINTS, readings
 from reading_bank import scales as usual
 from simulated_sockets import SocketRows, rest_in_sockets
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.sockets import stages_by_sockets
+from diffeo_calib.calibration.result import errors_by_kind
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -28,7 +30,8 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import Geometry, SimulatedArm
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import twist_transform
 
 
@@ -186,35 +189,19 @@ def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
     assert found / region_factor(4 + TRACKED, 3) == pytest.approx(alone / region_factor(4 + 1, 3), rel=1e-9)
 
 
-def test_a_known_base_is_kept(arm: SimulatedArm, resting: dc.Measurements) -> None:
-    """The ball is the same in every frame, the sockets move with it."""
-    bare = register_sockets(arm.nominal, resting.q, resting.socket)
-    T = arm.truth.base
-    placed = replace(Geometry.nominal(arm.nominal), base=T)
-    found = register_sockets(placed, resting.q, resting.socket)
-    torch.testing.assert_close(found.identification.geometry.tool, bare.identification.geometry.tool)
-    torch.testing.assert_close(found.positions, bare.positions @ T[:3, :3].mT + T[:3, 3])
-
-
-def test_evaluation_of_each_kind(
-    result: Any, tracked: dc.Measurements, resting: dc.Measurements, mixture: dc.Measurements
-) -> None:
-    new = tracked.rows(slice(TRACKED, None))
-    positions = dc.evaluate(result.model, new)
-    assert positions.rms == pytest.approx(rms(result.model(new.q)[:, 0] - new.points[:, 0]), rel=1e-9)
+def test_evaluation_of_each_kind(result: Any, tracked: Any, resting: Any, mixture: Any) -> None:
+    new, model, summary = tracked.rows(slice(TRACKED, None)), result.model, result.model.summary
+    positions, spread, both = (dc.evaluate(model, rows) for rows in (new, resting, mixture))
+    assert positions.rms == pytest.approx(rms(model(new.q)[:, 0] - new.points[:, 0]), rel=1e-9)
     assert positions.rms < 3e-4
-    spread = dc.evaluate(result.model, resting)
-    both = dc.evaluate(result.model, mixture)
     assert both["position"].count == TRACKED
-    assert both.rms == pytest.approx(dc.evaluate(result.model, mixture.device_rows()).rms, rel=1e-12)
+    assert both.rms == pytest.approx(dc.evaluate(model, mixture.device_rows()).rms, rel=1e-12)
+    assert both.rms == pytest.approx(summary.diffeomorphic_rms, rel=1e-12)
     assert both["socket"].rms == pytest.approx(spread.rms, rel=1e-12)
-    errors = [one.error for one in spread.distances]
-    assert [one.error for one in both["socket"].distances] == pytest.approx(errors, abs=1e-12)
-    assert len(both["socket"].distances) == 4
+    assert len(both["socket"].distances) == len(spread.distances) == 4
     left_out = result.leave_one_out.errors
     assert result.left_out_rms == pytest.approx(rms(left_out[:TRACKED, :3]), rel=1e-9)
     assert result.left_out["socket"].rms == pytest.approx(rms(left_out[TRACKED:, 3:]), rel=1e-9)
-    assert both.rms == pytest.approx(result.model.summary.diffeomorphic_rms, rel=1e-12)
 
 
 def test_several_set_ups_of_the_device(
@@ -244,19 +231,13 @@ def test_splits_hold_out_measured_positions(mixture: dc.Measurements) -> None:
     assert torch.equal(held.sort().values, torch.arange(TRACKED))
 
 
-def test_joined_and_taken_apart(mixture: dc.Measurements, tracked: dc.Measurements, resting: dc.Measurements) -> None:
-    assert not mixture.without_device
+def test_joined_and_taken_apart(mixture: Any, tracked: Any, resting: Any) -> None:
     assert mixture.device_rows().sha256 == tracked.rows(slice(TRACKED)).sha256
     assert mixture.socket_rows().sha256 == resting.sha256
-    assert torch.equal(mixture.visible.sum(0), torch.tensor([TRACKED, len(resting)]))
-    assert mixture.sha256 != dc.Measurements.joined([tracked.rows(slice(1, TRACKED + 1)), resting]).sha256
     assert "2 markers, the last one in 8 sockets in 64 of the rows" in repr(mixture)
     frame = mixture.to_frame()
     assert list(frame.columns[6:]) == ["socket", "x", "y", "z"]
-    assert frame["socket"].iloc[0] == ""
-    assert frame["x"].isna().sum() == len(resting)
-    again = dc.Measurements.joined([mixture, tracked.rows(slice(TRACKED, None))])
-    assert (len(again), again.markers) == (TRACKED + 84, 2)
+    assert frame["x"].isna().sum() == (frame["socket"] != "").sum() == len(resting)
 
 
 def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
@@ -299,23 +280,123 @@ def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, rest
         stages_by_sockets(arm.nominal, dc.Measurements.joined([tracked, other]))
 
 
-@pytest.mark.parametrize(
-    ("use", "message"),
-    [
-        (lambda t, s: [t.rows([0, 1]), s], "9 unknowns .* expected at least 3 poses"),
-        (lambda t, s: [t, s.rows(slice(0, 9))], r"at least 2 rows in every socket.*, got '0/1' in 1 row"),
-        (lambda t, s: [with_attributes(t, points=1e3 * t.points), s], "positions seem to be 1000 times too large"),
-        (lambda t, s: [t.with_payload(1.0), s.with_payload(0.0)], "rows with sockets: expected no payloads"),
-        (lambda t, s: [t.with_payload(1.0), s], "the tables differ in payload"),
-        (lambda t, s: [t, s.with_joint_names([f"q{k}" for k in range(6)])], "the tables differ in joint_names"),
-    ],
-)  # fmt: skip
-def test_refused(
-    use: Callable[..., list[dc.Measurements]],
-    message: str,
-    arm: SimulatedArm,
-    tracked: dc.Measurements,
-    resting: dc.Measurements,
-) -> None:
-    with pytest.raises(MeasurementError, match=message):
-        stages_by_sockets(arm.nominal, dc.Measurements.joined(use(tracked, resting)))
+def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:
+    def staged(*tables: Any) -> Callable[[], object]:
+        return lambda: stages_by_sockets(arm.nominal, dc.Measurements.joined(tables))
+
+    large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
+    loaded = tracked.with_payload(1.0)
+    refused(
+        ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
+        (r"at least 2 rows in every socket.*, got '0/1' in 1 row", staged(tracked, resting.rows(slice(0, 9)))),
+        ("positions seem to be 1000 times too large", staged(large, resting)),
+        ("rows with sockets: expected no payloads", staged(loaded, resting.with_payload(0.0))),
+        ("the tables differ in payload", staged(loaded, resting)),
+        ("the tables differ in joint_names", staged(tracked, resting.with_joint_names(renamed))),
+    )
+
+
+# --- tables of several kinds ------------------------------------------------------------------------------------------
+
+PLAIN = SimulatedArm(3)
+NAMES = PLAIN.nominal.joint_names
+NOISE = 2e-5
+
+
+def positions(count: int) -> dc.Measurements:
+    return dc.Measurements(*PLAIN.measure(count, seed=4), NAMES)
+
+
+def sockets() -> dc.Measurements:
+    rows = rest_in_sockets(PLAIN, seed=3, places=4, rows=5)
+    return dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances={("0", "1"): 0.05}, distance_std=1e-5)
+
+
+def read(kind: str, count: int, zero: float = 0.0) -> dc.Readings:
+    return readings(PLAIN, kind, count, zero, noise=NOISE)
+
+
+def fit_of(parts: list[object], **options: object) -> Any:
+    """Of the joined tables, with the noise of each kind given."""
+    data = dc.Observations.joined(parts)
+    other = torch.full((len({part.kind for part in data.parts}) - 1,), NOISE, dtype=torch.float64)
+    given = replace(usual(), other_noise=other if len(other) else None)
+    return dc.calibrate(PLAIN.nominal, data, hyperparameters=given, **options)  # type: ignore[arg-type]
+
+
+def ball_errors(result: Any, *, free: bool, q: Tensor | None = None) -> Tensor:
+    """Errors (N, 3) of the ball, m; after a rigid fit if no device says where the robot stands."""
+    q = PLAIN.sample(200, 9) if q is None else q
+    truth, found = PLAIN.true_points(q)[:, 0], result.model(q).detach()[:, -1]
+    T = rigid_fit(found, truth) if free else torch.eye(4, dtype=torch.float64)
+    return found @ T[:3, :3].mT + T[:3, 3] - truth
+
+
+CASES = {
+    "sockets, distances": lambda: [sockets(), read("distance", 36)],
+    "positions, distances from another zero": lambda: [positions(25), read("distance", 36, 0.03)],
+    "positions, sockets, images": lambda: [positions(20), sockets(), read("image", 24)],
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * ("images" in name)) for name in CASES])
+def test_as_accurate_as_expected(name: str) -> None:
+    """Better than geometry, and as good as the model says; errors of every kind are judged by themselves."""
+    parts = CASES[name]()
+    result = fit_of(parts)
+    free = not any(part.kind == "position" for part in parts)
+    error = rms(ball_errors(result, free=free))
+    assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
+    assert result.fit.converged
+    kinds = errors_by_kind(result, dc.Observations.joined(parts))
+    assert len(kinds) == len(parts)
+    for one in kinds.values():
+        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
+
+
+@pytest.fixture(scope="module")
+def joint() -> Any:
+    return fit_of([positions(25), read("distance", 36)])
+
+
+@pytest.mark.slow
+def test_devices_are_where_they_are_within_their_deviations(joint: Any) -> None:
+    """Three fixed points in the tracker's frame, and the ball as a marker of its own."""
+    base = PLAIN.truth.base
+    ranges = joint.readings[0]
+    errors = ranges.devices.constants[:, :3] - (POINTS @ base[:3, :3].mT + base[:3, 3])
+    away = errors / ranges.known[:, :3]
+    assert float(away.square().mean()) < 4.0
+    assert 1e-6 < float(ranges.known[:, :3].max()) < 1e-3
+    assert float((joint.model.geometry.tool[1] - PLAIN.truth.tool[0]).norm()) < 1e-3
+    assert joint.model.markers == 2
+    assert "mm in the measuring frame" in joint.placement.sentences()[0]
+
+
+@pytest.mark.slow
+def test_the_order_of_the_rows_does_not_matter() -> None:
+    data = dc.Observations.joined([positions(20), read("distance", 24), read("height", 24)])
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
+    order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
+    mixed = data.rows(order.tolist())
+    assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
+    q, given = PLAIN.sample(20, 9), replace(usual(), other_noise=torch.full((2,), NOISE, dtype=torch.float64))
+    one, other = (dc.calibrate(PLAIN.nominal, rows, hyperparameters=given).model(q) for rows in (data, mixed))
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_controls(joint: Any) -> None:
+    """Fewer momenta than rows: the deviations of devices are found as well."""
+    coarse = fit_of([positions(25), read("distance", 36)], controls=40)
+    for one, other in zip(joint.readings, coarse.readings, strict=True):
+        torch.testing.assert_close(other.known, one.known, rtol=0.1, atol=1e-6)
+    assert rms(joint.model(PLAIN.sample(50, 2)).detach() - coarse.model(PLAIN.sample(50, 2)).detach()) < 1e-4
+
+
+def test_poses_in_a_table_of_several_kinds_are_refused() -> None:
+    q = PLAIN.sample(30, 2)
+    posed = dc.Measurements.from_poses(q, PLAIN.truth.marker_poses(q)[:, 0], NAMES)
+    for rows, kind in ((read("distance", 36), "distances"), (sockets(), "sockets")):
+        with pytest.raises(MeasurementError, match=f"expected positions, got poses and {kind}"):
+            fit_of([posed, rows])

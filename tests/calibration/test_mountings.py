@@ -9,9 +9,10 @@ import pytest
 import torch
 from kind_bank import remounted
 from product_bank import usual_scales
+from table_bank import refused
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
@@ -126,16 +127,12 @@ def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None
 def test_set_ups_are_named(tmp_path: Path) -> None:
     path, columns = tmp_path / "t.csv", ["x", "y", "z"]
     write_measurements(path, remounted(ARM, table(10, 1)), TableFormat("m", "rad"))
-    known: dict[str, Any] = {"length": "m", "angle": "rad"}
-    with pytest.raises(MeasurementError, match="`remounted` without `session`"):
-        dc.read_measurements(path, ARM.nominal, columns, remounted=True, **known)
-    same = dc.read_measurements(path, ARM.nominal, columns, remounted=True, session="session", **known)
+    known: dict[str, Any] = {"length": "m", "angle": "rad", "remounted": True}
+    same = dc.read_measurements(path, ARM.nominal, columns, session="session", **known)
     assert (same.remounted, same.session_names) == (True, ("a", "b", "c"))
-
-
-def test_poses_are_refused() -> None:
-    q = ARM.sample(6, seed=1)
-    poses = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
-    data = dc.Measurements.from_poses(q, poses, ARM.nominal.joint_names, doubt=False)
-    with pytest.raises(MeasurementError, match="expected positions, got poses"):
-        data.with_sessions(list("aabbcc"), remounted=True)
+    q, poses = ARM.sample(6, seed=1), torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
+    posed = dc.Measurements.from_poses(q, poses, ARM.nominal.joint_names, doubt=False)
+    refused(
+        ("`remounted` without `session`", lambda: dc.read_measurements(path, ARM.nominal, columns, **known)),
+        ("expected positions, got poses", lambda: posed.with_sessions(list("aabbcc"), remounted=True)),
+    )

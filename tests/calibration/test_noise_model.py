@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from simulated_camera import camera_arm
 from tangent_bank import built, normal
 from torch import Tensor
-from torch.testing import assert_close
 
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.differing_noise import differing_factor, noise_of_new_rows
@@ -130,20 +129,6 @@ def test_squares_of_a_pose_do_not_depend_on_its_lever() -> None:
     assert found == pytest.approx([expected] * 3, rel=1e-4)
 
 
-@pytest.mark.parametrize(("sensor", "m"), [(NoiseModel(3), 9), (pose_sensor(5), 9)])
-def test_squares_of_noise_itself_count_its_coordinates(sensor: NoiseModel, m: int) -> None:
-    covariance = covariances(5, m, seed=13)
-    expected = torch.full((5, sensor.bodies), float(sensor.freedom), dtype=torch.float64)
-    assert_close(sensor.squares(covariance, covariance), expected)
-    root = torch.linalg.cholesky(covariance[:1])
-    draws = (root @ normal(4000, m, 1, seed=14))[:, :, 0]
-    same = replace(sensor, modes=None if sensor.modes is None else sensor.modes[:1].expand(4000, -1, -1, -1))
-    squares = same.squares(covariance[:1].expand(4000, -1, -1), draws[:, :, None] * draws[:, None])
-    for body in range(sensor.bodies):
-        share = float((squares[:, body] > float(chi2.isf(0.1, sensor.freedom))).double().mean())
-        assert share == pytest.approx(0.1, abs=0.02)
-
-
 # --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
@@ -169,12 +154,6 @@ def share(errors: Tensor, covariance: Tensor) -> float:
         squares = (found * torch.linalg.solve(covariance[own, own], found.mT).mT).sum(1)
         inside.append(float((squares < INSIDE_95).double().mean()))
     return sum(inside) / len(inside)
-
-
-def test_the_same_noise_everywhere_is_not_widened() -> None:
-    one = blocks(1, 6, 0)
-    same = one.expand(20, 6, 6)
-    assert differing_factor(same, one[0], everywhere(same)) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_regions_hold_95_percent_of_a_mixture() -> None:

@@ -51,18 +51,12 @@ def kept_all(result: Any, data: dc.Measurements) -> None:
         assert outlier.weight < 0.25
 
 
-# --- clean data -----------------------------------------------------------------------------------------------------
-
-
 def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider: Case) -> None:
     for case in (arm, pair, posed, slider):
         assert case.result.outliers == []
         assert float(case.result.tails.weights.min()) > 0.5
         assert case.result.tails.freedom > 10
         kept_all(case.result, case.train)
-
-
-# --- one marker -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -159,9 +153,6 @@ def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     assert held_out(result, test) < 1.1 * clean
 
 
-# --- several markers ------------------------------------------------------------------------------------------------
-
-
 def test_reasons_with_three_markers() -> None:
     """One fit: 0 and 2 exchanged in row 5, marker 1 off by 2 mm in row 8, row 13 the points of row 20."""
     arm, train, test = simulated(25, markers=3)
@@ -184,9 +175,6 @@ def test_reasons_with_three_markers() -> None:
     assert held_out(result, test) < 0.4 * geometry
 
 
-# --- poses ----------------------------------------------------------------------------------------------------------
-
-
 def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     """A pose is one measurement: it has one weight."""
     poses = posed.train.poses.clone()
@@ -201,9 +189,6 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     errors, before = (dc.evaluate(model, posed.test) for model in (result.model, posed.model))
     assert errors.rms < 2.0 * before.rms
     assert (errors.angle_rms or 9.0) < 1.5 * (before.angle_rms or 0.0)
-
-
-# --- a real robot ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -155,16 +155,6 @@ def test_another_marker(arm: Case) -> None:
     assert 0.9 < within_region(found.model, test) <= 1.0
 
 
-def test_old_models_with_control_points(arm: Case) -> None:
-    scales = arm.result.selection.scales
-    coarse = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, controls=30).model
-    robot = simulated(1)[0]
-    new, test = measured(robot, NEW_ROWS, 5), measured(robot, 100, 6)
-    found = dc.recalibrate(coarse, new, drift="none")
-    assert len(found.model.configurations) == 60 + NEW_ROWS
-    assert dc.evaluate(found.model, test).rms < dc.evaluate(coarse.registered(new, learn=False), test).rms
-
-
 def test_models_of_a_robot_before_and_after_wear(arm: Case) -> None:
     """Whatever frame they are in: what differs is the joint."""
     robot = worn(2, 3.0)
@@ -276,14 +266,6 @@ def test_a_ur10_measured_again(ur10_folder: Path) -> None:
     found = dc.recalibrate(old, new)
     assert dc.evaluate(found.model, test).rms < 0.9 * dc.evaluate(old.registered(new, learn=False), test).rms
     assert within_region(found.model, test) > 0.83
-
-
-def test_a_drift_is_part_of_what_left_out_rows_are_predicted_with(arm: Case) -> None:
-    robot = simulated(1)[0].worn(1, 6.0)
-    found = dc.recalibrate(arm.model, measured(robot, 20, 5))
-    assert [change.part for change in found.changes.found][:1] == [robot.nominal.joint_names[1]]
-    error = dc.evaluate(found.model, measured(robot, 200, 6)).rms
-    assert found.left_out_rms < 3 * error < 0.5 * found.rms_before
 
 
 def test_what_is_refused(arm: Case, new: dc.Measurements) -> None:

@@ -17,7 +17,6 @@ from kind_bank import kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
 ARM = again_bank.arm()
@@ -169,21 +168,6 @@ def test_every_session_has_its_own_frame() -> None:
     between = between if frames.reference == 0 else torch.linalg.inv(between)
     seen = again_bank.ELSEWHERE @ between @ torch.linalg.inv(again_bank.ELSEWHERE)
     torch.testing.assert_close(other[:3, :3], seen[:3, :3], rtol=0, atol=3e-4)
-
-
-def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
-    kind = kind_named("poses")
-    rows: Any = kind.new
-    first = (len(rows) + 1) // 2
-    moved = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
-    moved[first:] = far = twist_transform(again_bank.one(0.3, -0.2, 0.1, 0.2, -0.1, 0.3))
-    new = rows.in_frames(moved).with_sessions(["before"] * first + ["after"] * (len(rows) - first))
-    found = quietly(dc.recalibrate, kind.model, new)
-    assert found.changes.found == ()
-    assert found.rms_after < 1.3 * quietly(dc.recalibrate, kind.model, rows).rms_after
-    frames: Any = next(iter(found.placement))
-    assert frames.names == ("before", "after")
-    torch.testing.assert_close(frames.transforms[1], far, rtol=0, atol=2e-3)
 
 
 def test_a_ball_the_model_does_not_know_is_one_more_marker() -> None:

@@ -95,10 +95,7 @@ def test_rows_that_cannot_be_those_of_the_robot_are_refused() -> None:
 
     still, numbered = POINTS[:1].expand_as(POINTS).clone(), [f"q{k}" for k in range(1, 7)]
     refused(
-        (
-            r"never move.* got 0 m; .*a ball in one hand that rests in sockets",
-            calibrated(Q, still),
-        ),
+        (r"never move.* got 0 m; .*a ball in one hand that rests in sockets", calibrated(Q, still)),
         (r"expected 6 joints .waist_joint.*, got 5; check the base and tip", calibrated(Q[:, :5], POINTS)),
         ("put the columns in the robot's order", calibrated(Q, POINTS, joint_names=ROBOT.joint_names[::-1])),
         (r"got \S*q1.*joints=.*from_dh\(\.\.\., names=", calibrated(Q, POINTS, joint_names=numbered)),
@@ -160,10 +157,7 @@ def test_rows_that_no_reading_explains_are_warned_about() -> None:
 @pytest.mark.parametrize(
     ("points", "words"),
     [
-        (
-            POINTS[torch.randperm(30, generator=torch.Generator().manual_seed(0))],
-            f"{NOT_THIS_ROBOT}, even with geo",
-        ),
+        (POINTS[torch.randperm(30, generator=torch.Generator().manual_seed(0))], f"{NOT_THIS_ROBOT}, even with geo"),
         (ROBOT(Q)[:, None, :3, 3].contiguous(), "show no errors of the robot"),
     ],
 )

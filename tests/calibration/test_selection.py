@@ -28,8 +28,6 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
     SEARCH_LIMITS,
-    SMALLEST_LOAD_RATIO,
-    TRANSMISSION_STARTS_RAD,
     SearchLimits,
     Selection,
     defaults,
@@ -71,23 +69,6 @@ def test_every_part_moves_the_markers_by_less_than_the_residual_at_first(setting
             assert float(covariance.diagonal().mean().sqrt()) <= 1.001 * share * noise
     total = gravity_covariance(scales, nominal, data.theta, data.x)
     assert float(total.diagonal().mean().sqrt()) > 0.3 * noise
-
-
-def test_joints_without_load_are_not_granted_any_compliance(setting: Setting) -> None:
-    """The last joint turns about the tip: it has next to no features, and nothing may be divided by them."""
-    for name in ("compliance", "lateral_compliance"):
-        values = getattr(setting.scales, name)
-        assert float(values.max() / values.min()) <= 1.001 / SMALLEST_LOAD_RATIO
-
-
-def test_a_slide_that_stands_still_has_a_long_kernel() -> None:
-    """A field as large as the noise does not fold a kernel of many times its length."""
-    setting, slide = built("sliding"), 2
-    x = setting.tangent_data.x.clone()
-    x[:, slide] = x[0, slide]
-    for noise in (1e-3, 1e-2):
-        scales = defaults(replace(setting.tangent_data, x=x), noise, setting.identification.prior)
-        assert_close(float(scales.coupled_lengthscale[slide]), 50 * noise)
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
@@ -301,23 +282,6 @@ def test_a_given_start_is_where_the_search_begins() -> None:
     torch.testing.assert_close(begun.scales.logarithms(), start.logarithms(), rtol=1e-12, atol=1e-12)
     climbed = select(setting.scales, setting.tangent_data, start=start, limits=brief(1))
     assert value(setting, climbed.scales) > value(setting, start)
-
-
-def test_without_a_start_there_is_one_for_every_length_scale_of_the_transmissions() -> None:
-    setting, began = built("mimic joint"), []
-
-    def progress(_: str, done: int, total: int) -> None:
-        began.extend([total] * (done in (1, len(TRANSMISSION_STARTS_RAD) + 1)))  # two iterations each
-
-    selection = select(setting.scales, setting.tangent_data, limits=brief(2), progress=progress)
-    assert began == [4, 4]
-    for lengthscale in TRANSMISSION_STARTS_RAD:
-        other = setting.scales.transmission_lengthscale * lengthscale / TRANSMISSION_STARTS_RAD[0]
-        start = replace(setting.scales, transmission_lengthscale=other)
-        assert value(setting, selection.scales) > value(setting, start)
-    began.clear()
-    select(setting.scales, setting.tangent_data, start=setting.scales, limits=brief(2), progress=progress)
-    assert began == [2]
 
 
 def test_interrupted_later_keeps_the_best_so_far() -> None:

@@ -1,19 +1,19 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
 from command_bank import Command
 from product_bank import usual_scales, with_usual_scales
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
@@ -70,8 +70,8 @@ def test_the_frames_are_found(result: Any) -> None:
     truth = torch.stack([frames()[NAMES.index(name)] for name in sessions.names])
     expected = truth @ torch.linalg.inv(truth[sessions.reference])
     centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
-    torch.testing.assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
+    assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
+    assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
     assert len(sessions.sentences()) == len(NAMES) - 1
 
 
@@ -113,7 +113,7 @@ def test_poses_in_several_sessions(arm: SimulatedArm) -> None:
     data = dc.Measurements.from_poses(q, poses, arm.nominal.joint_names)
     data = data.with_sessions(["a"] * 40 + ["b"] * 40)
     found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal)).sessions
-    torch.testing.assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
+    assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
 
 
 def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
@@ -121,8 +121,8 @@ def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
     quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
     data = dc.Measurements(q, arm.true_points(q), std=torch.tensor([1.0, 2.0, 3.0]).mul(1e-4).expand(5, 2, 3))
     turned = data.in_frames(quarter.expand(5, 4, 4))
-    torch.testing.assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
-    torch.testing.assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
+    assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
+    assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
 
 
 def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
@@ -151,38 +151,25 @@ TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle
 
 def other_names(text: str) -> str:
     """A table whose sessions the model does not know."""
-    for name in NAMES:
-        text = text.replace(name, f"new {name}")
-    return text
+    return re.sub("Monday|Tuesday|Friday", lambda found: f"new {found[0]}", text)
 
 
-def test_every_other_session_is_evaluated_where_it_fits_best(
-    table: dc.Measurements, result: Any, command: Command
-) -> None:
+def test_every_other_session_is_evaluated_where_it_fits_best(table: Any, result: Any, command: Command) -> None:
     dc.save(result.model, "m.safetensors")
     Path("t.csv").write_text(other_names(Path("t.csv").read_text()))
-    evaluate = ["evaluate", "m.safetensors", "t.csv", *TABLE]
-    done = command(*evaluate, "--session", "day", "--json", "e.json", "--residuals", "r.csv")
+    done = command("evaluate", "m.safetensors", "t.csv", *TABLE, "--session", "day", "--json", "e.json")
     assert done.code == 0, done.err
     assert not done.warnings
     assert "the frames of 3 sessions were found from these rows, 18 numbers in all" in " ".join(done.out.split())
-    written = json.loads(Path("e.json").read_text())
-    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
-    found = written["results"]["session_transforms"]
-    reference = other_names(result.sessions.names[result.sessions.reference])
+    found = json.loads(Path("e.json").read_text())["results"]
+    reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
     centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
-    truth = dict(zip(map(other_names, NAMES), frames(), strict=True))
-    for name, T in found.items():
-        expected = truth[name] @ torch.linalg.inv(truth[reference])
-        torch.testing.assert_close(torch.tensor(T, dtype=torch.float64) @ centre, expected @ centre, rtol=0, atol=3e-4)
-    rms = written["results"]["errors"]["all"]["rms_m"]
+    for name, T in zip(NAMES, frames(), strict=True):
+        own = torch.tensor(found["session_transforms"][f"new {name}"], dtype=torch.float64)
+        assert_close(own @ centre, T @ torch.linalg.inv(reference) @ centre, rtol=0, atol=3e-4)
+        assert found["errors"]["in_sessions"][f"new {name}"]["rows"] == ROWS // 3
     aligned = dc.evaluate(result.model, result.aligned(table)).rms
-    assert rms <= aligned * (1 + 1e-9)  # the places fit these rows best
-    assert rms > 0.5 * aligned
-    rows = {name: each["rows"] for name, each in written["results"]["errors"]["in_sessions"].items()}
-    assert rows == dict.fromkeys(truth, ROWS // 3)
-    sizes = np.loadtxt("r.csv", delimiter=",", skiprows=1, usecols=8)
-    assert float(np.sqrt(np.square(sizes).mean())) == pytest.approx(rms, rel=1e-6)
+    assert 0.5 * aligned < found["errors"]["all"]["rms_m"] <= aligned * (1 + 1e-9)  # the places fit these rows best
 
 
 def test_rows_of_other_sessions_in_one_frame_are_named(table: dc.Measurements, result: Any, command: Command) -> None:

@@ -106,9 +106,6 @@ def test_serial_formats_need_a_tip(export: object, model: dc.CalibratedKinematic
         export(model, tmp_path / "body.c")  # pyright: ignore[reportCallIssue]
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------
-
-
 def test_markers_say_on_which_tip_they_are(body: SimulatedUpperBody, data: dc.Measurements) -> None:
     with pytest.raises(MeasurementError, match=r"has 2 tips .* do not say on which .* pass Measurements\(..., on="):
         dc.calibrate(body.nominal, data.with_tips(None))

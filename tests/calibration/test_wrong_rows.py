@@ -264,15 +264,6 @@ def test_from_a_line_on(first: int, lag: int, words: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_part_of_the_rows_is_enough() -> None:
-    """As after a split."""
-    arm, train, _ = simulated(60)
-    some, _ = shifted(train, 25, -1).split(0.7, seed=0)
-    with pytest.raises(MeasurementError, match=r"from line 2[5-9] on .* the joints 1 line above"):
-        dc.calibrate(arm.nominal, some)
-
-
-@pytest.mark.slow
 def test_tables_that_are_right_pass() -> None:
     """With a few wrong rows, and with a pair of exchanged ones."""
     arm, train, _ = simulated(40)
