@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -64,9 +63,6 @@ def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
     assert summary.effective_parameters == result.leave_one_out.effective
     assert (summary.rows, summary.outliers) == (60, 0)
     assert summary.scales == result.selection.status
-    fit = result.fit
-    assert (summary.coupling_residual, summary.end_residual) == (fit.coupling_residual, fit.end_residual)
-    assert (summary.energy, summary.status) == (fit.energy, fit.status)
 
 
 @pytest.mark.slow
@@ -123,28 +119,21 @@ def test_a_prismatic_joint(slider: Case) -> None:
         assert term.periodic == (True, True, False, True, True, True)
 
 
-@dataclass(frozen=True)
-class Watched:
+def watched() -> tuple[Any, list[tuple[str, int, int]]]:
     """A calibration with twelve poses, and the progress that it reported."""
-
-    result: Any
-    steps: list[tuple[str, int, int]]
-
-
-def watched() -> Watched:
     steps: list[tuple[str, int, int]] = []
     arm, train, _ = simulated(12)
-    return Watched(dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps)
+    return dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps
 
 
 @pytest.fixture(scope="module")
-def twelve() -> Watched:
+def twelve() -> tuple[Any, list[tuple[str, int, int]]]:
     return watched()
 
 
 @pytest.mark.slow
-def test_two_runs_are_equal(twelve: Watched, arm: Case) -> None:
-    first, second = twelve.result, watched().result
+def test_two_runs_are_equal(twelve: Any, arm: Case) -> None:
+    first, second = twelve[0], watched()[0]
     assert torch.equal(first.model(arm.test.q), second.model(arm.test.q))
     assert torch.equal(first.selection.scales.logarithms(), second.selection.scales.logarithms())
     assert first.model.summary == second.model.summary
@@ -177,18 +166,18 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
 
 
-def test_twelve_poses_are_selected_on(twelve: Watched, arm: Case) -> None:
+def test_twelve_poses_are_selected_on(twelve: Any, arm: Case) -> None:
     """Without a warning: their leave-one-out errors are too few to judge the scales."""
-    result = twelve.result
+    result = twelve[0]
     assert "12 poses" in result.status
     assert "likelihood" in result.status
     assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(result.registration.geometry.points, arm.test).rms
 
 
-def test_progress_is_reported(twelve: Watched) -> None:
-    tasks = list(dict.fromkeys(task for task, _, _ in twelve.steps))
+def test_progress_is_reported(twelve: Any) -> None:
+    tasks = list(dict.fromkeys(task for task, _, _ in twelve[1]))
     assert tasks == ["registration", "geometry", "hyper-parameters", "cross-validation", "Gauss-Newton"]
-    assert all(0 <= done <= total for _, done, total in twelve.steps)
+    assert all(0 <= done <= total for _, done, total in twelve[1])
 
 
 # --- calibrations that end early --------------------------------------------------------------------------------------

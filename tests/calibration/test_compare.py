@@ -20,7 +20,6 @@ from torch.distributions import MultivariateNormal
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.changes import NOISE_FACTORS, SIZES, likelihood_ratios
 from diffeo_calib.calibration.recalibration.compare import Comparison
-from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 
 OFFSET = 1e-3
 """Of a joint, rad."""
@@ -44,14 +43,10 @@ def unchanged() -> Comparison:
     return compared_with(positions(arm(), 24, seed=5))
 
 
-def hidden_in(rows: dc.Measurements) -> tuple[HiddenOffset, ...]:
-    return compared_with(rows).hidden
-
-
 @pytest.mark.parametrize(("joint", "what"), [(0, "device"), (5, "markers")])
 def test_offsets_that_places_hide_are_named(joint: int, what: str) -> None:
     rows = with_offset(positions(arm(), 24, seed=5), joint)
-    (found,) = hidden_in(rows)
+    (found,) = compared_with(rows).hidden
     assert found.joint == arm().nominal.joint_names[joint]
     assert found.size == pytest.approx(OFFSET, abs=4 * found.deviation)
     assert found.deviation < 0.3 * OFFSET

@@ -129,9 +129,6 @@ def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     assert quantum(arm.train.q[:, 1], turning=True) is None
     assert quantum(values[:6], turning=True) is None  # a few round numbers are no evidence
     assert quantum(1e-6 * torch.rand(40, dtype=torch.float64), turning=True) is None  # nor is zero, of any step
-
-
-def test_the_step_of_a_slide() -> None:
     values = (torch.linspace(0.1, 0.6, 40, dtype=torch.float64).sqrt() * 1e3).round() / 1e3
     assert quantum(values, turning=False) == (pytest.approx(1e-3), "1 mm")
 

@@ -78,14 +78,6 @@ def test_means_are_quadratic_of_deviations_and_geometric_of_others(first: dc.Cal
         torch.testing.assert_close(getattr(mean, name), expected * getattr(scales, name))
 
 
-def test_a_part_that_a_model_does_not_need_stays_out(first: dc.CalibrationResult) -> None:
-    some = first.selection.scales
-    scales = replace(some, transmission_amplitude=torch.zeros_like(some.transmission_amplitude))
-    found = scales_of_models([with_scales(first.model, scales.vector)], scales)
-    assert not bool(found.transmission_amplitude.any())
-    torch.testing.assert_close(found.vector, scales.vector)
-
-
 def test_unusable_models_are_refused(first: dc.CalibrationResult) -> None:
     arm, data = measured(1)
     planar, model, wrong = from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), first.model, "model"

@@ -125,7 +125,6 @@ def test_the_commands_read_boards(seen: CameraArm, command: Command, tmp_path: P
     assert "--camera-on-tool without --rotation" in done.error
 
 
-# --- a head and its own hand: the camera's link, which the neck moves, is the base of the chain -----------------------
 
 
 NEW_ROWS = 40

@@ -284,19 +284,6 @@ def test_only_the_wrong_marker_loses_its_weight(result: Any) -> None:
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_what_was_seen(some: dc.Measurements, result: Any) -> None:
-    found = dc.evaluate(result.model, some)
-    distances = (some.points - result.model(some.q).detach()).norm(dim=-1)
-    seen = distances[some.visible]
-    assert_close(found.errors[some.visible], seen, rtol=1e-12, atol=0)
-    assert bool(found.errors[~some.visible].isnan().all())
-    assert found.rms == pytest.approx(float(seen.square().mean().sqrt()), rel=1e-12)
-    assert found.median == pytest.approx(float(seen.quantile(0.5)), rel=1e-12)
-    assert found.max == float(seen.max())
-    assert f"({len(seen)} distances" in repr(found)
-
-
-@pytest.mark.slow
 def test_model_file_knows_what_was_hidden(
     some: dc.Measurements, result: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -256,22 +254,6 @@ def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Me
         dc.Measurements.joined([mixture, other])
 
 
-def test_a_distance_that_contradicts_the_device(arm: SimulatedArm, rows: SocketRows, tracked: dc.Measurements) -> None:
-    def known(distance: float) -> dc.Measurements:
-        names, given = arm.nominal.joint_names, {("0", "1"): distance}
-        resting = dc.Measurements.from_sockets(rows.q, rows.names, names, distances=given, distance_std=1e-5)
-        return dc.Measurements.joined([tracked, resting])
-
-    given = replace(usual(), other_noise=torch.tensor([2e-5], dtype=torch.float64))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        dc.calibrate(arm.nominal, known(0.051), hyperparameters=given)
-    (text,) = [str(one.message) for one in caught if "seems to differ" in str(one.message)]
-    assert re.match(r"the distance of .*\(51.00 mm\) seems to differ by \+(0.9|1)", text), text
-    with pytest.raises(MeasurementError, match="check the unit of `distances`"):
-        stages_by_sockets(arm.nominal, known(50.0))
-
-
 def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
     bend = torch.zeros(6, dtype=torch.float64)
     bend[4] = 0.05
@@ -392,11 +374,3 @@ def test_controls(joint: Any) -> None:
     for one, other in zip(joint.readings, coarse.readings, strict=True):
         torch.testing.assert_close(other.known, one.known, rtol=0.1, atol=1e-6)
     assert rms(joint.model(PLAIN.sample(50, 2)).detach() - coarse.model(PLAIN.sample(50, 2)).detach()) < 1e-4
-
-
-def test_poses_in_a_table_of_several_kinds_are_refused() -> None:
-    q = PLAIN.sample(30, 2)
-    posed = dc.Measurements.from_poses(q, PLAIN.truth.marker_poses(q)[:, 0], NAMES)
-    for rows, kind in ((read("distance", 36), "distances"), (sockets(), "sockets")):
-        with pytest.raises(MeasurementError, match=f"expected positions, got poses and {kind}"):
-            fit_of([posed, rows])

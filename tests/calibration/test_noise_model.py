@@ -116,19 +116,6 @@ def test_squares_of_poses() -> None:
         assert float(found[row, 0]) == pytest.approx(expected, rel=1e-9)
 
 
-def test_squares_of_a_pose_do_not_depend_on_its_lever() -> None:
-    """Shift and turn are the same thing for near and far points."""
-    frames, twist, found = poses(1), normal(6, seed=12), []
-    sizes = torch.tensor([2.0, 2.0, 2.0, 0.3, 0.3, 0.3], dtype=torch.float64)
-    for lever in (0.01, 0.1, 3.0):
-        modes = mark_jacobian(frames, lever)
-        sensor, error = NoiseModel(1, 9, modes=modes[:, None]), (modes @ twist)[0]
-        covariance = (modes * sizes.square()) @ modes.mT + 1e-9 * torch.eye(9, dtype=torch.float64)
-        found.append(float(sensor.squares(covariance, torch.outer(error, error)[None])))
-    expected = float((twist / sizes).square().sum())
-    assert found == pytest.approx([expected] * 3, rel=1e-4)
-
-
 # --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))

@@ -138,7 +138,6 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     kept_all(result, data)
 
 
-@pytest.mark.slow
 def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     robot, train, test = simulated(60)
     q = torch.cat([train.q, train.q[:20]])
@@ -191,23 +190,11 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     assert (errors.angle_rms or 9.0) < 1.5 * (before.angle_rms or 0.0)
 
 
-@pytest.mark.slow
 def test_a_clean_ur10(ur10_150: Case) -> None:
     assert ur10_150.result.outliers == []
     assert 1e3 * ur10_150.held_out()[2] < 0.18
 
 
-@pytest.mark.slow
-def test_one_row_of_a_ur10_wrong_by_50_mm(ur10_150: Case) -> None:
-    points = ur10_150.train.points.clone()
-    points[7] += aside(0.05, 7)
-    scales = ur10_150.result.selection.scales
-    result = dc.calibrate(ur10_150.robot, dc.Measurements(ur10_150.train.q, points), hyperparameters=scales)
-    assert list(flagged(result)) == [(7, None)]
-    assert held_out(result, ur10_150.test) < 1.05 * ur10_150.held_out()[2]
-
-
-@pytest.mark.slow
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: Case) -> None:
     """The tool turns by only 0.5 mrad in these rows: 0.02 rad in one of them outweigh all other rows."""
     q = ur10_150.train.q.clone()
@@ -217,7 +204,6 @@ def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: C
     assert held_out(result, ur10_150.test) < 1.1 * ur10_150.held_out()[2]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
     """With Student's t a third of the true places was inside at 5 %."""

@@ -16,7 +16,6 @@ from tangent_bank import built, shaken, tangent_covariance
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.plan import move_times, short_path
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
@@ -164,12 +163,6 @@ def test_a_plan_can_be_made_in_parts() -> None:
     assert "guesses" in str(whole)
 
 
-def test_no_candidate_is_taken_twice() -> None:
-    arm = SimulatedArm(seed=1)
-    q = arm.sample(1, seed=3).repeat(4, 1)
-    assert sorted(dc.plan(arm.nominal, q, 4, target=arm.sample(20, seed=5)).rows.tolist()) == [0, 1, 2, 3]
-
-
 def test_many_candidates_and_targets() -> None:
     """More targets than are followed, more coordinates than main directions, a robot with a slide, two markers."""
     robot = sliding_robot()
@@ -179,21 +172,6 @@ def test_many_candidates_and_targets() -> None:
     best = dc.plan(robot, q, 10, target=q, marker=MARKER).expected_rms[-1]
     assert len(set(plan.rows.tolist())) == 10
     assert float(best) < 0.9 * float(drawn.mean())
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 40])
-def test_the_path_is_short(count: int) -> None:
-    rng = np.random.default_rng(0)
-    q = torch.from_numpy(rng.uniform(-2, 2, (count, 4)))
-    times = move_times(q, (True, True, True, False))
-    path = short_path(times)
-    assert sorted(path.tolist()) == list(range(count))
-
-    def length(order: Tensor) -> float:
-        return float(times[order[:-1], order[1:]].sum())
-
-    random = [length(torch.from_numpy(rng.permutation(count))) for _ in range(20)]
-    assert length(path) <= (0.6 if count == 40 else 1.0) * min(random) + 1e-12
 
 
 def test_expected_errors_are_those_of_the_simulated_arm(arm: Case) -> None:

@@ -182,9 +182,6 @@ def test_rows_outside_of_the_old_range_say_nothing_about_change(arm: Case) -> No
     assert "changes were not tested" in str(found)
 
 
-# --- rows that an old model must not be made to fit -------------------------------------------------------------------
-
-
 def noisy(data: dc.Measurements, metres: float, std: float | None = None) -> dc.Measurements:
     generator = torch.Generator().manual_seed(3)
     noise = metres * torch.randn(data.points.shape, generator=generator, dtype=torch.float64)

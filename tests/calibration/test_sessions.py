@@ -94,12 +94,12 @@ def test_rows_of_several_set_ups_are_not_compared_with_a_model(arm: SimulatedArm
         dc.evaluate(result.model, data.rows([0, 2, 4]))
 
 
-@pytest.mark.parametrize("names", [5, "abcdef", ["a", None, "b", "b", "a", "a"], ["a", " ", "b", "b", "a", "a"]])
-def test_names_of_sessions(names: Any) -> None:
+def test_names_of_sessions() -> None:
     q = torch.zeros(6, 2, dtype=torch.float64)
-    data = dc.Measurements(q, torch.zeros(6, 3, dtype=torch.float64), doubt=False)
-    with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
-        data.with_sessions(names)
+    data: Any = dc.Measurements(q, torch.zeros(6, 3, dtype=torch.float64), doubt=False)
+    for names in (5, "abcdef", ["a", "b"], ["a", None, "b", "b", "a", "a"], ["a", " ", "b", "b", "a", "a"]):
+        with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
+            data.with_sessions(names)
     assert data.with_sessions([" a", "a "] * 3).session_names == ("a",)
 
 
@@ -129,8 +129,6 @@ def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
     data = campaign(arm, shuffled=False)
     with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 'b' in 3 rows"):
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * (ROWS - 3) + ["b"] * 3))
-    with pytest.raises(MeasurementError, match="the names of sessions: expected 105 names, one per row, got 2"):
-        data.with_sessions(["a", "b"])
 
 
 @pytest.fixture

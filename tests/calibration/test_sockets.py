@@ -230,22 +230,6 @@ def test_evaluation_of_rows_in_sockets(result: Any, data: dc.Measurements) -> No
     assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
 
 
-@pytest.mark.slow
-def test_few_control_points(arm: SimulatedArm, data: dc.Measurements, result: Any) -> None:
-    scales = result.selection.scales
-    coarse = dc.calibrate(arm.nominal, data, controls=100, hyperparameters=scales).sockets
-    whole = dc.calibrate(arm.nominal, data, hyperparameters=scales).sockets
-    torch.testing.assert_close(coarse.positions, whole.positions, rtol=0, atol=5e-5)
-    torch.testing.assert_close(coarse.deviations, whole.deviations, rtol=1e-2, atol=1e-7)
-
-
-def test_registered_where_a_tracker_stands(arm: SimulatedArm, result: Any) -> None:
-    q, points = arm.measure(40, seed=7)
-    names = arm.nominal.joint_names
-    seen = result.model.registered(dc.Measurements(q[:10], points[:10], names))
-    assert dc.evaluate(seen, dc.Measurements(q[10:], points[10:], names)).rms < 7e-4
-
-
 # --- rows that cannot be right ----------------------------------------------------------------------------------------
 
 PAIR = ("0", "1")
@@ -264,13 +248,6 @@ def some(plain: SimulatedArm) -> SocketRows:
 def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> dc.Measurements:
     given = {"distances": DISTANCES, "distance_std": 3e-5} | options
     return dc.Measurements.from_sockets(rows.q, names or rows.names, **given)  # pyright: ignore[reportArgumentType]
-
-
-def test_clean_rows_pass(plain: SimulatedArm, some: SocketRows) -> None:
-    places, placed, (registration, identification) = stages_by_sockets(plain.nominal, table(some))
-    assert identification.rms < registration.rms < 2e-3
-    assert len(places.positions) == 6
-    assert bool(placed.points.isfinite().all())
 
 
 def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:

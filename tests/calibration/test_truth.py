@@ -33,16 +33,6 @@ def only_transmission() -> Case:
     return calibrated(60, geometry=0, gravity=0, noise=FINE)
 
 
-@pytest.fixture(scope="module")
-def only_gravity() -> Case:
-    return calibrated(40, geometry=0, transmission=0)
-
-
-@pytest.fixture(scope="module")
-def only_geometry() -> Case:
-    return calibrated(40, transmission=0, gravity=0)
-
-
 def truth(**errors: float) -> SimulatedArm:
     return simulated(1, **errors)[0]
 
@@ -131,28 +121,25 @@ def test_transmission_alone(only_transmission: Case) -> None:
     assert only_transmission.held_out()[2] < 0.03 * 1e-3
 
 
-def test_gravity_alone(only_gravity: Case) -> None:
-    source, found, q = truth(geometry=0, transmission=0), sizes(only_gravity), only_gravity.train.q
-    deflected = rms(pushed(source, q, source.components(q).gravity))
-    assert deflected > 0.5
-    assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
-    assert sum(transmissions(only_gravity).values()) < 0.02
+@pytest.mark.parametrize("name", ["gravity", "geometry"])
+def test_one_source_of_error_alone(name: str) -> None:
+    other = "geometry" if name == "gravity" else "gravity"
+    case, source = calibrated(40, transmission=0, **{other: 0}), truth(transmission=0, **{other: 0})
+    found, q = sizes(case), case.train.q
+    if name == "gravity":
+        deflected = rms(pushed(source, q, source.components(q).gravity))
+        assert deflected > 0.5
+        assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
+    else:
+        beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
+        assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
+        assert found["gravity on joints"] < 0.015
+    assert sum(transmissions(case).values()) < 0.02
     for nothing in ("gravity on links", "coupled joint errors", "task space"):
-        assert found[nothing] < 0.01, nothing
-    assert wrong_geometry(only_gravity, source) < 0.04
-    assert only_gravity.held_out()[2] < 0.06e-3
-
-
-def test_geometry_alone(only_geometry: Case) -> None:
-    source, found, q = truth(transmission=0, gravity=0), sizes(only_geometry), only_geometry.train.q
-    beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
-    assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
-    assert sum(transmissions(only_geometry).values()) < 0.02
-    for nothing in ("gravity on joints", "gravity on links", "coupled joint errors", "task space"):
         assert found[nothing] < 0.015, nothing
-    assert wrong_geometry(only_geometry, source) < 0.04
-    _, geometry, diffeomorphic = only_geometry.held_out()
-    assert diffeomorphic < 1.05 * geometry
+    assert wrong_geometry(case, source) < 0.04
+    _, geometry, diffeomorphic = case.held_out()
+    assert diffeomorphic < (0.06e-3 if name == "gravity" else 1.05 * geometry)
 
 
 def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
@@ -212,7 +199,6 @@ def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> 
     assert diffeomorphic < 0.35 * geometry
 
 
-@pytest.mark.slow
 def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Path) -> None:
     robot, data = ur10_measurements(ur10_folder)
     inside, outside = split_by_first_joint(data)

@@ -32,7 +32,6 @@ from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.robots.se3 import rotation
 
 pytestmark = [
@@ -158,16 +157,6 @@ def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> 
     assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
     alone = rows.rows([name == "right" for name in rows.camera_names])
     check_hand_eyes(dc.recalibrate(on_tool().model, alone).model, 1e-4)
-
-
-def test_poses_of_two_boards_in_cameras_on_the_tool() -> None:
-    """By another program, without corners."""
-    rows = on_tool().data
-    boards = inverse_poses(rows.poses)
-    names = rows.camera_names
-    data = dc.Measurements.from_poses(rows.q, boards, rows.joint_names, camera_on_tool=True)
-    model = dc.calibrate(on_tool().robot, data.with_sessions(names, remounted=True), hyperparameters=SCALES).model
-    assert on_tool().error_mm(model(rows.q), rows.q) < 0.6
 
 
 def test_tables_of_several_cameras_that_cannot_be() -> None:

@@ -69,13 +69,6 @@ def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case)
     assert "moving the measuring device by 200 mm" in text
 
 
-def test_a_block_without_a_common_cause(arm: Case) -> None:
-    generator = torch.Generator().manual_seed(0)
-    data = changed(arm, slice(20, 30), 0.1 * torch.randn(10, 1, 3, generator=generator, dtype=torch.float64))
-    text = block_text(arm.model, data, contradicted(arm.model, data))
-    assert "for no common reason" in text
-
-
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
 def test_random_rows_are_rarely_a_block(share: float) -> None:
     generator = torch.Generator().manual_seed(1)
