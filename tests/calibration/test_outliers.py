@@ -1,7 +1,4 @@
-"""Outliers: they must not spoil the fit, and the result names them with a probable cause.
-
-One wrong row and three markers show that the choice of scales is not disturbed; elsewhere the scales are given.
-"""
+"""Outliers: they must not spoil the fit, and the result names them with a probable cause; few fits choose scales."""
 
 from __future__ import annotations
 
