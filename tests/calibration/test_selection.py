@@ -220,9 +220,6 @@ def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:
     torch.testing.assert_close(wide[0].gradient, wide[1].gradient, rtol=1e-4, atol=1e-4)
 
 
-# --- the search -------------------------------------------------------------------------------------------------------
-
-
 def brief(iterations: int = 5, **others: int) -> SearchLimits:
     """A search with ``iterations`` iterations from every start."""
     each = dict.fromkeys(("iterations", "first", "fewest_first", "most_first"), iterations)
@@ -247,9 +244,6 @@ def interrupting(calls: int) -> Callable[..., None]:
     return progress
 
 
-# --- the search ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: Setting) -> None:
     selection = select(setting.scales, setting.tangent_data)
@@ -260,15 +254,6 @@ def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: S
     assert not selection.interrupted
     moved = selection.scales.logarithms() - setting.scales.logarithms()
     assert float(moved.abs().max()) <= SEARCH_LIMITS.log_range + 1e-9
-
-
-def test_same_seed_same_scales() -> None:
-    setting, limits = built("sliding"), brief(poses=15)
-    first, same, other = (select(setting.scales, setting.tangent_data, seed=seed, limits=limits) for seed in (0, 0, 1))
-    assert torch.equal(first.scales.logarithms(), same.scales.logarithms())
-    assert first.status == same.status
-    assert "on 15 poses" in first.status
-    assert not torch.equal(first.scales.logarithms(), other.scales.logarithms())
 
 
 def test_a_given_start_is_where_the_search_begins() -> None:
