@@ -125,8 +125,6 @@ def test_the_commands_read_boards(seen: CameraArm, command: Command, tmp_path: P
     assert "--camera-on-tool without --rotation" in done.error
 
 
-
-
 NEW_ROWS = 40
 
 
