@@ -1,15 +1,21 @@
-"""A camera on the tool that sees a fixed board: noise, true errors, hand-eye transform, and the wrong direction."""
+"""A camera on the tool that sees a fixed board, and a head that sees one on its own hand."""
 
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
 import torch
 from command_bank import Command
+from golden_bank import usual_scales
+from kind_bank import rigid_rms
 from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
+from simulated_head import CAMERA as HEAD_CAMERA
+from simulated_head import CAMERA_AWAY, SeeingHead
 from table_bank import held, says
 from torch.testing import assert_close
 
@@ -24,7 +30,7 @@ from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import rotation, twist_transform
 
 ROWS, TEST_ROWS = 60, 100
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3
@@ -79,10 +85,7 @@ def test_the_errors_of_a_camera_are_those_of_the_board_it_sees(seen: CameraArm) 
     found = HandEye.of(result.model)
     given = torch.tensor(CAMERA, dtype=torch.float64, device=HOST)
     corner = torch.tensor(BOARD, dtype=torch.float64, device=HOST) - middle
-    for one, place, turn in (
-        (found.camera, given[:3], given[3:]),
-        (found.board, corner, torch.zeros_like(corner)),
-    ):
+    for one, place, turn in ((found.camera, given[:3], given[3:]), (found.board, corner, torch.zeros_like(corner))):
         shift = one.pose[:3, 3] - place
         away = rotation(turn).mT @ one.pose[:3, :3]
         small = torch.stack([away[2, 1], away[0, 2], away[1, 0]])
@@ -115,10 +118,42 @@ def test_the_commands_read_boards(seen: CameraArm, command: Command, tmp_path: P
     board = torch.tensor(written["board_in_base"]["pose_m"], dtype=torch.float64)
     away = (board[:3, 3] - torch.tensor(BOARD, dtype=torch.float64)).abs()
     assert bool((away < 5 * torch.tensor(written["board_in_base"]["position_std_m"])).all())
-    judged = command("evaluate", model, csv, *OPTIONS[:-4], "--camera-on-tool")
-    assert judged.code == 0, judged.err
     done = command("fit", csv, "--robot", urdf, *OPTIONS, "-o", model)
     assert done.code == 1
     assert "--camera-on-tool" in done.error
     done = command("fit", csv, "--robot", urdf, *OPTIONS[:2], *OPTIONS[8:], "--camera-on-tool", "-o", model)
     assert "--camera-on-tool without --rotation" in done.error
+
+
+NEW_ROWS = 40
+
+
+@cache
+def head() -> SeeingHead:
+    return SeeingHead.drawn(60 + NEW_ROWS)
+
+
+@cache
+def calibrated() -> Any:
+    return dc.calibrate(head().robot, head().images(50, 0.1), hyperparameters=usual_scales(head().robot))
+
+
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+def test_errors_of_neck_and_arm_are_found() -> None:
+    new = head().q[-NEW_ROWS:]
+    truth = head().true_points(new)
+    nominal, found = (
+        1e3 * rigid_rms(points.detach(), truth)
+        for points in (calibrated().registration.geometry.points(new), calibrated().model(new))
+    )
+    assert nominal > 0.5
+    assert found < 0.2 * nominal
+
+
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+def test_the_optical_frame_is_where_it_is_in_the_link_of_the_camera() -> None:
+    own = HandEye.of(calibrated().model, camera_on_tool=False).camera
+    truth = twist_transform(torch.tensor(CAMERA_AWAY, dtype=torch.float64))
+    assert own.link == HEAD_CAMERA
+    assert bool(((own.pose - truth)[:3, 3].abs() < 4 * own.deviations[:3]).all())
+    assert float(own.deviations[:3].max()) < 3e-3
