@@ -16,16 +16,16 @@ from __future__ import annotations
 import inspect
 import shlex
 import sys
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
-from diffeo_calib.cli.options import CORNERS
+from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, Option, check_together, has, options_in, pages
 from diffeo_calib.cli.record import check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.common.files import PROGRAM
@@ -115,112 +115,49 @@ Json = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Command:
-    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them.
+def _declare(name: str, options: type[Command]) -> None:
+    """Declare a command by the class of its options; every command has --json."""
+    own = list(options_in(options))
+    named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
+    DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
-    Attributes:
-        needs: option -> those of which it needs one. beside: option -> those that it cannot stand beside.
-    """
+    def run(_json: Any, **given: Any) -> None:
+        made = _made(options, given)
+        files: dict[str, dict[str, Path]] = {"write": dict(made.more_files), "read": {}, "appended": {}, "folder": {}}
+        for one in own:
+            value = given[one.field]
+            for path in value if isinstance(value, list) else [value]:
+                if isinstance(path, Path):
+                    files[one.file][one.shown + f" {path}" * isinstance(value, list)] = path
+        check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
+        check_together(options, given, made.needs, made.beside)
+        made.check()
+        import_module(f"diffeo_calib.cli.commands.{name}").run(made)
 
-    needs: ClassVar[dict[str, str]] = {}
-    beside: ClassVar[dict[str, str]] = {}
-
-    def check(self) -> None:
-        """Refuse options that cannot be meant."""
-
-    @property
-    def more_files(self) -> dict[str, Path]:
-        """Files that are written beside those that options name."""
-        return {}
-
-
-Options = TypeVar("Options", bound=Command)
-
-
-def command(name: str) -> Callable[[type[Options]], type[Options]]:
-    """Declare a command by the class of its options, whose fields may be groups of more; every command has --json."""
-
-    def declare(plain: type[Options]) -> type[Options]:
-        options = dataclass(frozen=True, kw_only=True)(plain)
-        leaves = dict(leaves_of(options))
-        named = {one: hint for hint, field in leaves.values() for one in names_of(field)} | {"--json": Path}
-        DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
-
-        def run(_json: Any, **given: Any) -> None:
-            made = _made(options, given)
-            files: dict[str, dict[str, Path]] = {
-                "write": dict(made.more_files),
-                "read": {},
-                "appended": {},
-                "folder": {},
-            }
-            for key, (_, field) in leaves.items():
-                for path in given[key] if isinstance(given[key], list) else [given[key]]:
-                    if isinstance(path, Path):
-                        shown = names_of(field)[0] + f" {path}" * isinstance(given[key], list)
-                        files[field.metadata["file"]][shown] = path
-            check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
-            check_together(typed_options(leaves, given), options.needs, options.beside)
-            made.check()
-            import_module(f"diffeo_calib.cli.commands.{name}").run(made)
-
-        json = inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json)
-        parameters = [*(_parameter(hint, field) for hint, field in leaves.values()), json]
-        run.__name__, run.__doc__ = f"{name}_command", plain.__doc__
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
-        vars(run)["__signature__"] = inspect.Signature(parameters)
-        app.command(name)(run)
-        return options
-
-    return declare
+    json = inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json)
+    parameters = [*map(_parameter, own), json]
+    run.__name__, run.__doc__ = f"{name}_command", pages()[name][0]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    app.command(name)(run)
 
 
-def leaves_of(group: Any) -> Iterator[tuple[str, tuple[Any, Field[Any]]]]:
-    """Name, type and field of the options of a group and of the groups in it."""
-    hints = get_type_hints(group)
-    for field in fields(group):
-        own = hints[field.name]
-        yield from leaves_of(own) if is_dataclass(own) else [(field.name, (own, field))]
-
-
-def names_of(field: Field[Any]) -> tuple[str, ...]:
-    """What the user types for an option, or reads for an argument."""
-    if field.metadata["made"] is typer.Argument:
-        return (field.metadata["how"]["metavar"],)
-    return field.metadata["names"] or (f"--{field.name.replace('_', '-')}",)
-
-
-def typed_options(leaves: Mapping[str, tuple[Any, Field[Any]]], given: Mapping[str, Any]) -> set[str]:
-    """The options and arguments whose values are not those by default."""
-    return {names_of(field)[0] for key, (_, field) in leaves.items() if given[key] not in (None, [], field.default)}
-
-
-def check_together(typed: Container[str], needs: Mapping[str, str], beside: Mapping[str, str]) -> None:
-    """Refuse an option without those, separated by spaces, of which it needs one, or beside those that exclude it."""
-    for option, others in needs.items():
-        if option in typed and not any(other in typed for other in others.split()):
-            what = f"{option} without {' or '.join(others.split())}"
-            raise InputError.of(what, fix="name this too, or leave the option out")
-    for option, others in beside.items():
-        for other in others.split():
-            if option in typed and other in typed:
-                raise InputError.of(f"{option} beside {other}", fix="leave one of them out")
-
-
-def _parameter(hint: Any, field: Field[Any]) -> inspect.Parameter:
-    """A field as typer reads it."""
-    names = names_of(field) if field.metadata["made"] is typer.Option else ()
-    annotation = Annotated[hint, field.metadata["made"](*names, **field.metadata["how"])]
-    default = inspect.Parameter.empty if field.default is MISSING else field.default
-    return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+def _parameter(option: Option) -> inspect.Parameter:
+    """An option as typer reads it."""
+    made = typer.Option(*option.names, **option.how) if option.names else typer.Argument(**option.how)
+    default = inspect.Parameter.empty if option.default is MISSING else option.default
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(option.field, kind, default=default, annotation=Annotated[option.hint, made])
 
 
 def _made(group: Any, given: dict[str, Any]) -> Any:
     """A group of options, and the groups in it, from the values of all."""
-    hints = get_type_hints(group)
-    names = [field.name for field in fields(group)]
+    hints, names = get_type_hints(group), [field.name for field in fields(group)]
     return group(**{name: _made(hints[name], given) if is_dataclass(hints[name]) else given[name] for name in names})
+
+
+for _name, _options in COMMANDS.items():
+    _declare(_name, _options)
 
 
 def _print_version(wanted: bool) -> None:
@@ -308,8 +245,3 @@ def _text(path: Path, name: str, value: object, hint: Any) -> str:
         begin = str(value).rpartition("=")[0] + "="
     file = str(value).removeprefix(begin)
     return f"{begin}{path.parent / file}" if begin or has(hint, Path) else file
-
-
-def has(hint: Any, part: type) -> bool:
-    """Whether a type, or a part of it, is this one."""
-    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))

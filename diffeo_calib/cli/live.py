@@ -14,7 +14,7 @@ from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, as_line, check_cel
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.declarations import CampaignOptions
+from diffeo_calib.cli.options import CampaignOptions
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns

@@ -6,7 +6,7 @@ out of step with their joints, or a median error above a tenth of the robot's re
 3 the fit stopped before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is
 written).
 
-The module declarations.py only declares the commands. Each command imports its work when it runs, so that help, the
+Each command imports its work when it runs, so that help, the
 version and shell completion load neither torch nor SciPy and appear at once.
 """
 
@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
-from diffeo_calib.cli import declarations  # noqa: F401  # declares the commands
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.record import record

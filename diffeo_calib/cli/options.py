@@ -1,174 +1,178 @@
-"""The options that several commands share: their types and their help. Imports nothing slow: help appears at once.
+"""The options of all commands: their types and values by default; help.md says what they mean. Imports nothing slow.
 
-A group of options is a frozen dataclass: a command with a field of this type has all of its options.
+A group of options is a frozen dataclass: a command with a field of this type has all of its options. The field
+`joint_length` is the option --joint-length.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import typer
+from typing_extensions import dataclass_transform
 
+from diffeo_calib.common.errors import InputError
+
+HELP = Path(__file__).with_name("help.md")
+SHORT = {"output": "-o", "count": "-n"}
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
 DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
 
-
-def option(
-    text: str,
-    metavar: str | None = None,
-    *,
-    names: tuple[str, ...] = (),
-    default: Any = None,
-    file: File = "read",
-    **limits: Any,
-) -> Any:
-    """A field of a group: an option of the name of the field, unless ``names`` are given.
-
-    Args:
-        text: its help. metavar: what its value is called. default: of the field; ... for an option that is required.
-        file: what happens to the file that a path names. limits: of its value, as of :func:`typer.Option`.
-    """
-    return _field(typer.Option, names, default, file, help=text, metavar=metavar, **limits)
-
-
-def argument(metavar: str, text: str, *, default: Any = ..., file: File = "read") -> Any:
-    """A field that is an argument, under the name ``metavar``; arguments as of :func:`option`."""
-    return _field(typer.Argument, (), default, file, help=text, metavar=metavar)
-
-
-def _field(made: Any, names: tuple[str, ...], default: Any, file: File, **how: Any) -> Any:
-    """A field of what typer makes with these names and options, such as its help."""
-    metadata = {"made": made, "names": names, "file": file, "how": how}
-    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
-
-
-def written(text: str, metavar: str) -> Any:
-    """A file that the command writes if it is wanted."""
-    return option(text, metavar, file="write")
-
-
-def output(text: str, metavar: str, default: Any = ...) -> Any:
-    """The option -o, a file that the command writes."""
-    return option(text, metavar, names=("-o", "--output"), default=default, file="write")
-
-
-File = Literal["read", "write", "appended", "folder"]
-"""What happens to a file: it must exist, is written, may come later, or is a folder that is made."""
 Length = Literal["m", "mm", "cm", "inch"]
 """As in measurements/table_format.py, which loads torch."""
 Angle = Literal["rad", "deg"]
 Frame = Literal["base", "measuring"]
-
-CONVENTION = (
-    "How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, or an order of Euler angles, extrinsic (such as "
-    "xyz) or intrinsic (such as XYZ)."
-)
-ROTATION_ANGLE = "Unit of Euler angles and rotation vectors."
-PAYLOAD = "Column with the known mass that the robot carried, in any unit."
-
-# --- how a table is written ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class Units:
-    """How tables are written; a model knows that of the table of its fit."""
-
-    length: Length | None = option(
-        "Unit of positions in the table, and of prismatic joints; needed where no model knows it."
-    )
-    angle: Angle | None = option("Unit of revolute joints in the table; needed where no model knows it.")
-    joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
-    joints: str | None = option(
-        "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of "
-        "the table, such as -{J2}+90 or {J3}+{J2}.",
-        "A,B,...",
-    )
-    robot_pose: str | None = option(
-        "Columns of the commanded place or pose, as the controller writes it, in place of "
-        "joint values and a robot's description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the "
-        "unit of --angle; or A,B,...=FILE.py:NAME, a function of yours that makes places or poses of these columns.",
-        "X,Y,Z[,...]",
-    )
-    sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")
-    decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
+Free = Literal["both", "base", "marker"]
+"""Parts of the set-up that may have moved."""
+ToolFrom = Literal["tip", "measured"]
+Convention = Literal["standard", "craig"]
+Text, Texts, File = str | None, list[str] | None, Path | None
+Written, Output = Annotated[Path | None, "write"], Annotated[Path, "write"]
+"""Files that a command writes, beside those that it reads, those that may come later, and folders that it makes."""
+Seed = Annotated[int, {"min": 0, "max": LARGEST_SEED}]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Places:
-    """Measured places in a file of their own."""
+class Option(NamedTuple):
+    """An option or an argument, as typer takes it.
 
-    places: Path | None = option(
-        "File with the measured places where CSV has the joint values alone; --by joins both.", "FILE"
-    )
-    by: str | None = option(
-        "Column of both files: texts that are the same in both, such as names of poses; or times, of which the nearest "
-        "within half a step belong together. Of two recordings the clocks may differ, and every stop becomes a row.",
-        "COLUMN",
-    )
+    Args:
+        field: its field. hint, default: of its value; MISSING where it is required. names: as typed, none of an
+            argument. shown: in messages. file: what happens to a file: "read", "write", "appended" (may come later) or
+            "folder" (is made). how: help and limits.
+    """
+
+    field: str
+    hint: Any
+    default: Any
+    names: tuple[str, ...]
+    shown: str
+    file: str
+    how: dict[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True)
+@cache
+def pages() -> dict[str, tuple[str, dict[str, str]]]:
+    """Section of help.md -> its text, and field -> its entry."""
+    found = {}
+    for section in HELP.read_text(encoding="utf-8").split("\n# ")[1:]:
+        name, _, body = section.partition("\n")
+        text, *entries = re.split("^(?=[-*] )", body, flags=re.MULTILINE)
+        found[name] = text.strip(), {re.split("[ :]", entry)[1]: " ".join(entry.split()) for entry in entries}
+    return found
+
+
+def options_in(group: Any) -> Iterator[Option]:
+    """The options of a group, or of a command, and of the groups in it."""
+    section = group.__name__.removesuffix("Options").lower()
+    texts = pages()["shared"][1] | pages().get(section, ("", {}))[1]
+    hints = get_type_hints(group, include_extras=True)
+    for field in fields(group):
+        hint, *more = get_args(hint) if get_origin(hint := hints[field.name]) is Annotated else (hint,)
+        if is_dataclass(hint):
+            yield from options_in(hint)
+            continue
+        head, _, text = texts[field.name].partition(": ")
+        mark, _, *named = head.split(" ")
+        long = f"--{field.name.replace('_', '-')}"
+        names = () if mark == "*" else tuple(filter(None, (SHORT.get(field.name), long)))
+        file = next((one for one in more if isinstance(one, str)), "read")
+        how = {"help": text, "metavar": named[0] if named else None}
+        how |= next((one for one in more if isinstance(one, dict)), {})
+        yield Option(field.name, hint, field.default, names, named[0] if mark == "*" else names[0], file, how)
+
+
+def has(hint: Any, part: Any) -> bool:
+    """Whether a type, or a part of it, is this one."""
+    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
+
+
+def check_together(
+    group: Any, given: Mapping[str, Any], needs: Mapping[str, str], beside: Mapping[str, str] | None = None
+) -> None:
+    """Refuse options of a group without those, separated by spaces, of which each needs one, or beside others."""
+    typed: Container[str] = {one.shown for one in options_in(group) if given[one.field] not in (None, [], one.default)}
+    for option, others in needs.items():
+        if option in typed and not any(other in typed for other in others.split()):
+            what = f"{option} without {' or '.join(others.split())}"
+            raise InputError.of(what, fix="name this too, or leave the option out")
+    for option, others in (beside or {}).items():
+        for other in others.split():
+            if option in typed and other in typed:
+                raise InputError.of(f"{option} beside {other}", fix="leave one of them out")
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class Options:
+    """A group of options."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+
+
+class Command(Options):
+    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them.
+
+    Attributes:
+        needs: option -> those of which it needs one. beside: option -> those that it cannot stand beside.
+    """
+
+    needs: ClassVar[dict[str, str]] = {}
+    beside: ClassVar[dict[str, str]] = {}
+
+    def check(self) -> None:
+        """Refuse options that cannot be meant."""
+
+    @property
+    def more_files(self) -> dict[str, Path]:
+        """Files that are written beside those that options name."""
+        return {}
+
+
+# --- groups -----------------------------------------------------------------------------------------------------------
+
+
+class Units(Options):
+    length: Length | None = None
+    angle: Angle | None = None
+    joint_length: Length | None = None
+    joints: Text = None
+    robot_pose: Text = None
+    sep: Text = None
+    decimal: Text = None
+
+
+class Places(Options):
+    places: File = None
+    by: Text = None
+
+
 class Rows(Places):
-    """Columns of the measurements in a table, of any kinds."""
-
-    position: list[str] | None = option(
-        "The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.", "X,Y,Z"
-    )
-    socket: str | None = option(
-        "Columns that name the socket in which a ball on the tool rested, in rows without a position.", "PLACE,SOCKET"
-    )
-    distance: list[str] | None = option(
-        "Known distance between two sockets, in the unit of --length; repeat for more.", "A,B=LENGTH"
-    )
-    distance_std: float | None = option("Standard deviation of these distances, in the unit of --length.")
-    reading: list[str] | None = option(
-        "What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
-        "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, "
-        "touched plane; a number in place of the column holds for all rows), image=U,V,FX,FY,CX,CY (pixels, focal "
-        "lengths and principal point of a camera), or corners=CAMERA.yaml (=WIDTH,HEIGHT of an unknown camera) for "
-        "corners of a printed board. --session names the fixed point, plane or camera of each row.",
-        "KIND=COLUMN",
-    )
-    marker: str | None = option(
-        "Column that names which marker a line holds, where each has the position of one (not with --rotation or "
-        "several --position, nor for readings and images). Lines with the same joint values that follow each other are "
-        "one row. With names in order where a model has them: COLUMN=A,B,...",
-        "COLUMN",
-    )
-    session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
-    remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
-    payload: str | None = option(PAYLOAD, "COLUMN")
-    time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
-    temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
-    rotation: list[str] | None = option(
-        "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
-        "several tips once per --position.",
-        "A,B,...",
-    )
-    convention: str | None = option(CONVENTION)
-    rotation_angle: Angle | None = option(ROTATION_ANGLE)
-    lever: float | None = option(
-        "Distance from a pose's origin to the three points that represent the pose, in the unit of --length: "
-        "it weighs orientation against position. 0.1 m by default."
-    )
-    camera_on_tool: bool = option(
-        "The poses, or corners, are those of a fixed board in the frame of a camera on the tool, as detectors "
-        "of boards give them; standard deviations are along the camera's axes.",
-        default=False,
-    )
-    std: str | None = option(
-        "Columns with standard deviations of the positions: one for all, one per marker or three per marker.", "A,B,..."
-    )
-    rotation_std: list[str] | None = option(
-        "Columns with standard deviations of the rotation about the measuring frame's axes, or one for all "
-        "three, in the unit of --rotation-angle; once per --rotation.",
-        "A,B,C",
-    )
+    position: Texts = None
+    socket: Text = None
+    distance: Texts = None
+    distance_std: float | None = None
+    reading: Texts = None
+    marker: Text = None
+    session: Text = None
+    remounted: bool = False
+    payload: Text = None
+    time: Text = None
+    temperature: Text = None
+    rotation: Texts = None
+    convention: Text = None
+    rotation_angle: Angle | None = None
+    lever: float | None = None
+    camera_on_tool: bool = False
+    std: Text = None
+    rotation_std: Texts = None
 
     @property
     def named(self) -> bool:
@@ -181,81 +185,254 @@ class Rows(Places):
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
-ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
-Convention = Literal["standard", "craig"]
+class Links(Options):
+    base: Text = None
+    tip: Texts = None
+    load: Texts = None
+    dh_convention: Convention | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Links:
-    """Which part of the robot in a file."""
-
-    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
-    tip: list[str] | None = option(
-        "Last link of the chain, to which the markers are fixed, by default that of the file; for several tips once "
-        "per --position. Of a DH table the last joint.",
-        "LINK",
-    )
-    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
-    dh_convention: Convention | None = option(
-        "Convention of a DH table that does not say its own; craig is also called modified."
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Robot:
-    """Which robot was measured; none where --robot-pose names commanded poses."""
-
-    robot: Path | None = option(ROBOT, "FILE")
+class Robot(Options):
     links: Links
+    robot: File = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Targets:
-    """Columns of the poses that a tool shall have."""
-
-    position: list[str] | None = option(
-        "Columns of the target positions of the tool, if the commands' own nominal poses are not the targets.", "X,Y,Z"
-    )
-    rotation: list[str] | None = option("Columns of the target orientations: 3, 4 or 9, see --convention.", "A,B,...")
-    convention: str | None = option(CONVENTION)
-    rotation_angle: Angle | None = option(ROTATION_ANGLE)
+class Targets(Options):
+    position: Texts = None
+    rotation: Texts = None
+    convention: Text = None
+    rotation_angle: Angle | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidates:
-    """Configurations to choose from: a table, or random ones within what the cell allows."""
-
-    candidates: Path | None = option("Choose from these configurations instead of random ones.", "CSV")
-    draw: int | None = option(f"Number of random candidates to choose from, {DRAWN} by default.", min=1)
-    limits: list[str] | None = option(
-        "Range of a joint within its limits; by default these, but one turn at most. Repeat for more joints.",
-        "JOINT=A:B",
-        names=("--range",),
-    )
-    tracker: str | None = option(
-        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker. Behind "
-        "it the direction in which the marker looks, in the frame of the tip (0,0,1), and the largest angle in degrees "
-        "between that and the line to the device (45).",
-        "X,Y,Z[,DX,DY,DZ[,DEG]]",
-    )
-    floor: float | None = option("Height in the base frame below which no link and no marker may be.", "Z")
-    column: str | None = option(
-        "Upright cylinder in the base frame that no link may enter: place, radius, and top if it ends.", "X,Y,R[,TOP]"
-    )
-    collisions: bool = option(
-        "Leave out poses in which the robot collides with itself, by its URDF; needs the extra `collisions`.",
-        default=False,
-    )
-    seed: int = option("Seed of the random candidates.", min=0, max=LARGEST_SEED, default=0)
+class Candidates(Options):
+    candidates: File = None
+    draw: Annotated[int | None, {"min": 1}] = None
+    range: Texts = None
+    tracker: Text = None
+    floor: float | None = None
+    column: Text = None
+    collisions: bool = False
+    seed: Seed = 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChangeTests:
-    """How changes since an old fit are tested."""
+class ChangeTests(Options):
+    marker_freedom: Literal["evidence", "same", "moved", "other"] = "evidence"
+    seed: Seed = 0
 
-    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
-        "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
-        "other ones (anywhere); by default the rows decide.",
-        default="evidence",
-    )
-    seed: int = option("Seed of the tests for changes.", min=0, max=LARGEST_SEED, default=0)
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+class FitOptions(Command):
+    csv: Path
+    robot: Robot
+    units: Units
+    output: Output
+    rows: Rows
+    holdout: Annotated[float, {"min": 0.0, "max": 0.9}] = 0.3
+    seed: Seed = 0
+    controls: Annotated[int | None, {"min": 10}] = None
+    figure: Written = None
+    report: Written = None
+    note: str = ""
+    scales_of: list[Path] | None = None
+    duplicates: str = "error"
+
+
+class CampaignOptions(Command):
+    csv: Annotated[Path, "appended"]
+    robot: Robot
+    units: Units
+    rows: Rows
+    target: Text = None
+    stdin: bool = False
+    json_lines: bool = False
+    once: bool = False
+    candidates: File = None
+    page: Text = None
+    next: Annotated[int, {"min": 0}] = 1
+    accepted: Written = None
+
+
+class RecordOptions(Command):
+    bag: Path
+    seen: str
+    output: Output
+    joints: str = "/joint_states"
+    still: Annotated[float, {"min": 1e-9}] = 1e-3
+    shortest: Annotated[float, {"min": 0.01}] = 0.5
+    offset: float | None = None
+
+
+class EvaluateOptions(Command):
+    model: Path
+    csv: Path
+    units: Units
+    rows: Rows
+    register: bool = False
+    free: Free | None = None
+    output: Written = None
+    fail_above: Text = None
+    residuals: Written = None
+    needs = dict.fromkeys(("--free", "-o"), "--register")
+    beside = dict.fromkeys(("--fail-above", "--residuals"), "--register")
+
+
+class InitOptions(Command):
+    csv: Path
+    places: Places
+    robot: File = None
+    output: Output = Path("campaign.toml")
+    force: bool = False
+
+
+class ImagesOptions(Command):
+    folders: list[Path]
+    joints: Path
+    board: str
+    length: Length
+    output: Output
+    board_std: float = 1e-3
+    overview: Written = None
+    sep: str = ","
+    decimal: str = "."
+
+
+class PredictOptions(Command):
+    model: Path
+    csv: Path
+    units: Units
+    output: Output
+    convention: Text = None
+    rotation_angle: Angle | None = None
+    payload: Text = None
+
+
+class CorrectOptions(Command):
+    model: Path
+    program: Path
+    units: Units
+    output: Output
+    targets: Targets
+    tip: Texts = None
+    tool: Texts = None
+    tool_from: ToolFrom = "tip"
+    frame: Frame = "base"
+    limit: float | None = None
+    rate: float | None = None
+    payload_mass: float | None = None
+
+
+class ExportOptions(Command):
+    model: Path
+    urdf: Written = None
+    mjcf: Written = None
+    dh: Written = None
+    dh_convention: Convention = "standard"
+    ur_kinematics: Written = None
+    ur_hash: Text = None
+    joint_offsets: Written = None
+    correction_tables: Written = None
+    with_tables: bool = False
+    c: Written = None
+    torch: Written = None
+    onnx: Written = None
+    field: Written = None
+    grid: str = "5x5x5"
+    camera: Annotated[Path | None, "folder"] = None
+    tool: Text = None
+    tool_from: ToolFrom = "tip"
+    frame: Frame | None = None
+    tip: Text = None
+    robot: File = None
+    payload_mass: float | None = None
+    length: Length = "m"
+    angle: Angle = "rad"
+    needs = dict.fromkeys(("--tool", "--frame"), "--c --torch --onnx") | {
+        "--with-tables": "--urdf --mjcf --dh --ur-kinematics",
+        "--ur-hash": "--ur-kinematics",
+        "--tip": "--c --dh",
+    }
+
+    @property
+    def outputs(self) -> dict[str, Path]:
+        """Option -> file to write, of those that are wanted."""
+        files = {one.shown: getattr(self, one.field) for one in options_in(ExportOptions) if one.file != "read"}
+        return {option: path for option, path in files.items() if path is not None}
+
+    @property
+    def more_files(self) -> dict[str, Path]:
+        """The header of C."""
+        return {} if self.c is None else {"--c (its header)": self.c.with_suffix(".h")}
+
+    def check(self) -> None:
+        """Refuse to write nothing."""
+        if not self.outputs:
+            files = ", ".join(one.shown for one in options_in(ExportOptions) if one.file != "read")
+            raise typer.BadParameter(f"name at least one file to write: {files}")
+        if self.with_tables and self.correction_tables is None:
+            raise InputError.of("--with-tables without --correction-tables", fix="name both, or none")
+
+
+class PlanOptions(Command):
+    count: Annotated[int, {"min": 1}]
+    units: Units
+    output: Output
+    cell: Candidates
+    links: Links
+    model: File = None
+    robot: File = None
+    marker: Texts = None
+    target_poses: File = None
+    measured: File = None
+    free: Free | None = None
+    sensor: Texts = None
+    payload_mass: float | None = None
+    needs = dict.fromkeys(("--payload-mass", "--free"), "MODEL")
+    beside = dict.fromkeys(("--robot", "--base", "--tip", "--load", "--dh-convention", "--marker"), "MODEL")
+    beside |= dict.fromkeys(("--draw", "--range", "--tracker", "--floor", "--column", "--collisions"), "--candidates")
+
+    def check(self) -> None:
+        """Refuse to plan for nothing."""
+        if self.model is None and self.robot is None:
+            raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
+
+
+class RecalibrateOptions(Command):
+    old: Path
+    csv: Path
+    units: Units
+    output: Output
+    rows: Rows
+    tests: ChangeTests
+    drift: Literal["tested", "none"] = "tested"
+    note: str = ""
+
+
+class CompareOptions(Command):
+    old: Path
+    other: Path
+    units: Units
+    rows: Rows
+    tests: ChangeTests
+
+
+class ReportOptions(Command):
+    model: Path
+    output: Output
+    units: Units
+    rows: Rows
+    data: File = None
+    against: Texts = None
+    tolerance: Text = None
+    needs = dict.fromkeys(("--position", "--socket", "--reading", "--length", "--angle", "--against"), "--data")
+
+
+class DemoOptions(Command):
+    output: Annotated[Path, "folder"] = Path("demo_output")
+    rows: Annotated[int, {"min": 20}] = 300
+    seed: Seed = 0
+
+
+COMMANDS = {own.__name__.removesuffix("Options").lower(): own for own in Command.__subclasses__()}
+"""By name, in the order of the help."""

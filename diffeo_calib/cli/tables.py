@@ -19,9 +19,9 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, check_together, has, leaves_of, names_of, typed_options
+from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
+from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, check_together, has, options_in
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
@@ -63,7 +63,7 @@ def table_format(units: Units) -> TableFormat:
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """The same format with the columns that options name, but for readings; lever in the unit of length."""
-    check_together(typed_options(dict(leaves_of(Rows)), vars(rows)), NEEDS, {})
+    check_together(Rows, vars(rows), NEEDS)
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
@@ -172,21 +172,21 @@ def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, 
     ValueError or IndexError for a value that is none.
     """
     found = dict[str, tuple[Any, list[str]]]()
-    for name, (hint, field) in leaves_of(group):
-        option, given = names_of(field)[0], list[list[str]]()
+    for option in options_in(group):
+        name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")
-            if begin == option:
-                given.append([option] if hint is bool else [option, value if equal else words[place + 1]])
+            if begin == name:
+                given.append([name] if hint is bool else [name, value if equal else words[place + 1]])
         given = given if has(hint, list) else given[-1:]
         texts = [own[-1] for own in given]
         allowed = next((get_args(one) for one in (hint, *get_args(hint)) if get_origin(one) is Literal), texts)
         if wrong := [text for text in texts if text not in allowed]:
-            raise ValueError(f"'{wrong[0]}' for {option}")
+            raise ValueError(f"'{wrong[0]}' for {name}")
         if given:
             values = [float(text) for text in texts] if has(hint, float) else texts
             value = True if hint is bool else values if has(hint, list) else values[-1]
-            found[name] = value, [word for own in given for word in own]
+            found[option.field] = value, [word for own in given for word in own]
     return found
 
 

@@ -15,9 +15,9 @@ from diffeo_calib.campaign.campaign import Campaign
 from diffeo_calib.campaign.feeds import Inbox, read_lines
 from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.models import robot_of
+from diffeo_calib.cli.options import CampaignOptions
 from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, measured_table

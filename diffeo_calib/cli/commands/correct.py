@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
-from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
+from diffeo_calib.cli.options import CorrectOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format, written_columns
 from diffeo_calib.common.checks import check_number

@@ -6,7 +6,7 @@ import shlex
 
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.declarations import DemoOptions
+from diffeo_calib.cli.options import DemoOptions
 from diffeo_calib.cli.record import make_folder
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.declarations import EvaluateOptions
 from diffeo_calib.cli.models import (
     another_date_lines,
     check_payload_column,
@@ -19,6 +18,7 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
+from diffeo_calib.cli.options import EvaluateOptions
 from diffeo_calib.cli.printed import (
     ErrorTable,
     accept,

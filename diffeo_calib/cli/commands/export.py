@@ -11,8 +11,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
-from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
+from diffeo_calib.cli.options import ExportOptions
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
@@ -140,7 +140,7 @@ class _Export:
 
 def run(given: ExportOptions) -> None:
     """Write the files, then say what each leaves of the model."""
-    wanted = {option: target for option, target in given.outputs.items() if target is not None}
+    wanted = given.outputs
     model = load_laden(given.model, given.payload_mass)
     units = TableFormat(given.length, given.angle)
     own = tool_in_tip(model, given.tool, given.tool_from, units)

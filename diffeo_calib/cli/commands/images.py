@@ -9,7 +9,7 @@ from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.declarations import ImagesOptions
+from diffeo_calib.cli.options import ImagesOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together

@@ -15,9 +15,8 @@ from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
-from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, Candidates
+from diffeo_calib.cli.options import DRAWN, Candidates, PlanOptions
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format, written_columns
@@ -137,7 +136,7 @@ def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list
     """Name of a joint -> its range, rad or m."""
     turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
     found = {}
-    for text in cell.limits or ():
+    for text in cell.range or ():
         name, _, ends = text.rpartition("=")
         if not name or ends.count(":") != 1:
             raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import PredictOptions, Rows
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows, written_columns
 from diffeo_calib.common.errors import InputError

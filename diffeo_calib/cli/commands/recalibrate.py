@@ -13,8 +13,8 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.declarations import RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
+from diffeo_calib.cli.options import RecalibrateOptions
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import few

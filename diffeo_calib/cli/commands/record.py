@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.declarations import RecordOptions
+from diffeo_calib.cli.options import RecordOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole

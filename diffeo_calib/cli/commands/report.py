@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.declarations import ReportOptions
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.options import ReportOptions
 from diffeo_calib.cli.printed import expectation_lines, parsed_length
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
