@@ -98,7 +98,7 @@ def check_together(
     group: Any, given: Mapping[str, Any], needs: Mapping[str, str], beside: Mapping[str, str] | None = None
 ) -> None:
     """Refuse options of a group without those, separated by spaces, of which each needs one, or beside others."""
-    typed: Container[str] = {one.shown for one in options_in(group) if given[one.field] not in (None, [], one.default)}
+    typed = {one.shown for one in options_in(group) if given[one.field] not in (None, [], one.default)}
     for option, others in needs.items():
         if option in typed and not any(other in typed for other in others.split()):
             what = f"{option} without {' or '.join(others.split())}"

@@ -18,12 +18,11 @@ POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 def run(given: DemoOptions) -> None:
     """Write an arm and its measurements, and calibrate it by a command that is printed."""
-    make_folder(given.output)
-    folder, rows, seed = given.output, given.rows, given.seed
-    arm = SimulatedArm(seed=seed)
+    make_folder(folder := given.output)
+    arm = SimulatedArm(seed=given.seed)
     urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
     arm.write_urdf(urdf)
-    data = Measurements(*arm.measure(rows, seed=seed), arm.nominal.joint_names)
+    data = Measurements(*arm.measure(given.rows, seed=given.seed), arm.nominal.joint_names)
     write_measurements(csv, data, TableFormat("mm", "deg"), position=POSITION)
     lines = [
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
@@ -31,7 +30,7 @@ def run(given: DemoOptions) -> None:
         ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
         ["--report", folder / "report.html"],
     ]
-    command = [[str(argument) for argument in line] for line in lines]
-    say(f"{rows} simulated measurements written to {csv}. Now running:\n")
-    say("  diffeo-calib " + " \\\n      ".join(shlex.join(line) for line in command) + "\n")
-    app([argument for line in command for argument in line])
+    command = [list(map(str, line)) for line in lines]
+    say(f"{given.rows} simulated measurements written to {csv}. Now running:\n")
+    say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
+    app([word for line in command for word in line])

@@ -19,7 +19,7 @@ from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, plan
 from diffeo_calib.cli.options import DRAWN, Candidates, PlanOptions
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format, written_columns
+from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -49,9 +49,8 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
         if text in TRACKERS:
             found.append(TRACKERS[text]())
         elif kind in SENSORS and values:
-            numbers.setdefault(kind, []).append(
-                [x / table.per_metre for x in stated_numbers("--sensor", values, (3, 4, 6))]
-            )
+            each = stated_numbers("--sensor", values, (3, 4, 6))
+            numbers.setdefault(kind, []).append([x / table.per_metre for x in each])
         else:
             expected = f"{', '.join(TRACKERS)}, or {', '.join(f'{kind}=NUMBERS' for kind in SENSORS)}"
             raise InputError.of(f"--sensor {text}", expected=expected)
@@ -80,17 +79,10 @@ def run(given: PlanOptions) -> None:
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = model is not None or any(one.of_frames for one in sensors)
-        found = plan(
-            source,
-            q,
-            count,
-            target=configurations(given.target_poses),
-            marker=None if framed else markers,
-            measured=configurations(given.measured),
-            free=given.free,
-            sensor=sensors,
-        )
-    found.write(output, table, written_columns(names))
+        target, measured = configurations(given.target_poses), configurations(given.measured)
+        how: dict[str, Any] = {"marker": None if framed else markers, "free": given.free, "sensor": sensors}
+        found = plan(source, q, count, target=target, measured=measured, **how)
+    found.write(output, table, names.written if isinstance(names, PoseColumns) else names)
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
@@ -153,11 +145,9 @@ OPEN_M = 0.01
 
 
 def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
-    """Print the expected errors by number of poses.
+    """Print the expected errors by number of poses, also as held-out errors of positions.
 
-    Args:
-        found: the plan. of_positions: whether held-out errors of the planned poses are errors of positions.
-        free: what has moved since the fit; without poses only its place would be expected to be wrong.
+    ``free`` has moved since the fit: without poses only its place would be expected to be wrong.
     """
     more = "" if found.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"
