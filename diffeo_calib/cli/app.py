@@ -26,7 +26,7 @@ import typer
 from typer.core import TyperGroup
 
 from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, Option, check_together, has, options_in, pages
-from diffeo_calib.cli.record import check_outputs, record, remove_earlier
+from diffeo_calib.cli.record import EXIT_INTERRUPTED, check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.common.files import PROGRAM
 
@@ -81,7 +81,13 @@ class FlagsOff(TyperGroup):
         """Run a command; a bad value is named without typer's own words, and without control characters."""
         try:
             with record.written(list(_arguments)):
-                return super().invoke(ctx)
+                try:
+                    return super().invoke(ctx)
+                except KeyboardInterrupt:  # there is no result to keep
+                    from diffeo_calib.cli.console import INTERRUPTED, show  # noqa: PLC0415
+
+                    show("error", f"{INTERRUPTED}.")
+                    raise typer.Exit(EXIT_INTERRUPTED) from None
         except typer.BadParameter as error:
             error.message = printable(error.message.removeprefix("Value error, "))
             raise

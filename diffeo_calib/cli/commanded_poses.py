@@ -15,9 +15,8 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.column_names import WORDS, column, whole
-from diffeo_calib.cli.guesses import ROTATIONS, Sheet
+from diffeo_calib.cli.guesses import ROTATIONS, Choice, RowColumns, Sheet, entries, matrix_in, rows_in
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet

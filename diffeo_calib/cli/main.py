@@ -6,8 +6,8 @@ out of step with their joints, or a median error above a tenth of the robot's re
 3 the fit stopped before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is
 written).
 
-Each command imports its work when it runs, so that help, the
-version and shell completion load neither torch nor SciPy and appear at once.
+Each command imports its work when it runs, so that help, the version and shell completion load neither torch nor SciPy
+and appear at once.
 """
 
 from __future__ import annotations
@@ -20,11 +20,9 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, interrupts
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.console import interrupts, show
+from diffeo_calib.cli.record import EXIT_ERROR, record
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
-
-EXIT_ERROR = 1
 
 
 def main() -> None:
@@ -36,53 +34,39 @@ def main() -> None:
         try:
             app()
         except DiffeoCalibError as error:
-            from diffeo_calib.cli.console import show_error  # noqa: PLC0415
-
-            show_error(error)
+            show("error", error)
             sys.exit(EXIT_ERROR)
-        except KeyboardInterrupt:
-            sys.exit(EXIT_INTERRUPTED)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Takes the place of :func:`warnings.showwarning`."""
-    from diffeo_calib.cli.console import show_warning  # noqa: PLC0415
-
-    record.warn(str(message))
-    show_warning(message)
+    record.warnings.append(str(message))
+    show("warning", message)
 
 
 class ForgivingStream:
-    """A text stream whose failures to write end the output, not the program.
-
-    Args:
-        stream: standard output or standard error; None where the process has none.
-    """
+    """A text stream, or the lack of one, whose failures to write end the output, not the program."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream if stream is not None else open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
     def write(self, text: str) -> int:
         """Write, or drop the text where that fails."""
-        try:
-            return self._stream.write(text)
-        except (OSError, ValueError):
-            self._give_up()
-            return len(text)
+        self._try(self._stream.write, text)
+        return len(text)
 
     def flush(self) -> None:
         """Flush, or drop what is buffered where that fails."""
-        try:
-            self._stream.flush()
-        except (OSError, ValueError):
-            self._give_up()
+        self._try(self._stream.flush)
 
-    def _give_up(self) -> None:
-        """Send the rest nowhere: the buffer, too, is flushed again when the interpreter ends."""
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+    def _try(self, action: Any, *given: str) -> None:
+        try:
+            action(*given)
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):  # the buffer, too, is flushed again when the interpreter ends
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -91,7 +75,11 @@ class ForgivingStream:
 @contextmanager
 def forgiving_streams() -> Iterator[None]:
     """Forgive failures of standard output and standard error inside."""
-    _open_missing()
+    for number in range(3):  # closed ones: the next file would be number 1 or 2, and take what others print
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (ForgivingStream(stream) for stream in before)  # pyright: ignore[reportAttributeAccessIssue]
     try:
@@ -100,12 +88,3 @@ def forgiving_streams() -> Iterator[None]:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         sys.stdout, sys.stderr = before
-
-
-def _open_missing() -> None:
-    """Open what the process was started without: the next file would be number 1 or 2, and take what others print."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number

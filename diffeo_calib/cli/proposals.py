@@ -21,13 +21,15 @@ from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     LENS,
     SOME_LENS,
+    Choice,
     JointColumns,
+    RowColumns,
     Sheet,
+    entries,
     guess_deviations,
     guess_rotation,
 )
 from diffeo_calib.cli.options import Rows
-from diffeo_calib.cli.row_columns import Choice, RowColumns, entries
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, few

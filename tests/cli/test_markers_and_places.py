@@ -10,8 +10,8 @@ import torch
 from command_bank import Command
 from torch.testing import assert_close
 
+from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows, Units
-from diffeo_calib.cli.row_columns import with_places
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.writing import write_rows

@@ -14,7 +14,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.options import FitOptions
 from diffeo_calib.cli.printed import (
@@ -49,7 +49,7 @@ Errors = dict[str, KindErrors]
 def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     source = measured_table(given.csv, given.rows, given.units, given.duplicates)
-    with exit_on_interrupt(), progress_bar() as progress:
+    with progress_bar() as progress:
         chain = robot_of(given.robot, source)
         others = [load_kinematics(path) for path in given.scales_of or ()]
         data = source.read(chain, given.robot.links.tip or chain.tips)

@@ -15,11 +15,22 @@ from typing import Any, NamedTuple, get_args
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import commanded_poses, proposals
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
+from diffeo_calib.cli.guesses import (
+    NAMED,
+    Choice,
+    JointColumns,
+    Sheet,
+    entries,
+    guess_joints,
+    guess_sheet,
+    joints_without_column,
+    rows_in,
+    tips_of,
+    with_places,
+)
 from diffeo_calib.cli.models import is_urdf, load_robot
 from diffeo_calib.cli.options import CORNERS, Convention, InitOptions, Links
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, entries, rows_in, tips_of, with_places
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet

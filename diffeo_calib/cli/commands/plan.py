@@ -14,7 +14,7 @@ from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
-from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
+from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, Candidates, PlanOptions
 from diffeo_calib.cli.printed import expectation_lines
@@ -60,7 +60,7 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
 def run(given: PlanOptions) -> None:
     """Plan, write the poses, and print what to expect of them."""
     cell, count, output = given.cell, given.count, given.output
-    with exit_on_interrupt(), progress_bar() as progress:
+    with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
         stated = given.units if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)

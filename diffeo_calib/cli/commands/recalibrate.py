@@ -12,7 +12,7 @@ from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
-from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.options import RecalibrateOptions
 from diffeo_calib.cli.printed import frame_lines, placement_lines
@@ -28,7 +28,7 @@ def run(given: RecalibrateOptions) -> None:
     source = table_of(model, given.csv, given.rows, given.units)
     how: Any = {"marker": tests.marker_freedom, "seed": tests.seed, "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
-    with exit_on_interrupt(), progress_bar() as progress:
+    with progress_bar() as progress:
         data = source.read(model.robot)
         warn_outside_range(model, data.q)
         result = recalibrate(model, data, progress=progress, **how)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.options import ReportOptions
 from diffeo_calib.cli.printed import expectation_lines, parsed_length
@@ -23,7 +23,7 @@ def run(wanted: ReportOptions) -> None:
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     how = {"against": wanted.against or [], "tolerance": tolerance}
-    with exit_on_interrupt(), progress_bar() as progress:
+    with progress_bar() as progress:
         found = write_report(model, wanted.output, data, **how, progress=progress)
     say(*provenance_lines(model))
     words, stages = verdict(found, tolerance), dict(found.expected)
