@@ -17,15 +17,15 @@ import inspect
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, Option, check_together, has, options_in, pages
+from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, description, has
 from diffeo_calib.cli.record import EXIT_INTERRUPTED, check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.common.files import PROGRAM
@@ -123,43 +123,34 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own = list(options_in(options))
+    own, parameters = list(options.all()), list[inspect.Parameter]()
     named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
     def run(_json: Any, **given: Any) -> None:
-        made = _made(options, given)
-        files: dict[str, dict[str, Path]] = {"write": dict(made.more_files), "read": {}, "appended": {}, "folder": {}}
+        made = options.made(given)
+        written, read, appended = dict(made.more_files), dict[str, Path](), dict[str, Path]()
+        files = {"output": written, "file": read, "files": read, "table": appended}
         for one in own:
             value = given[one.field]
             for path in value if isinstance(value, list) else [value]:
-                if isinstance(path, Path):
-                    files[one.file][one.shown + f" {path}" * isinstance(value, list)] = path
-        check_outputs(files["write"], files["read"] | files["appended"], may_come=files["appended"])
-        check_together(options, given, made.needs, made.beside)
+                if one.kind in files and path is not None:
+                    files[one.kind][one.shown + f" {path}" * isinstance(value, list)] = path
+        check_outputs(written, read | appended, may_come=appended)
+        options.check_together(given, made.needs, made.beside)
         made.check()
         import_module(f"diffeo_calib.cli.commands.{name}").run(made)
 
-    json = inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json)
-    parameters = [*map(_parameter, own), json]
-    run.__name__, run.__doc__ = f"{name}_command", pages()[name][0]
+    for one in own:
+        typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
+        default = inspect.Parameter.empty if one.default is MISSING else one.default
+        kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
+        parameters.append(inspect.Parameter(one.field, kind, default=default, annotation=annotation))
+    parameters.append(inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json))
+    run.__name__, run.__doc__ = f"{name}_command", description()[name][0]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(run)["__signature__"] = inspect.Signature(parameters)
     app.command(name)(run)
-
-
-def _parameter(option: Option) -> inspect.Parameter:
-    """An option as typer reads it."""
-    made = typer.Option(*option.names, **option.how) if option.names else typer.Argument(**option.how)
-    default = inspect.Parameter.empty if option.default is MISSING else option.default
-    kind = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Parameter(option.field, kind, default=default, annotation=Annotated[option.hint, made])
-
-
-def _made(group: Any, given: dict[str, Any]) -> Any:
-    """A group of options, and the groups in it, from the values of all."""
-    hints, names = get_type_hints(group), [field.name for field in fields(group)]
-    return group(**{name: _made(hints[name], given) if is_dataclass(hints[name]) else given[name] for name in names})
 
 
 for _name, _options in COMMANDS.items():

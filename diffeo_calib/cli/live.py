@@ -14,7 +14,7 @@ from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, as_line, check_cel
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CampaignOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.columns import Columns
@@ -40,7 +40,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    given: CampaignOptions
+    given: Command
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)

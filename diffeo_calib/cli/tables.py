@@ -21,7 +21,7 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, check_together, has, options_in
+from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
@@ -62,7 +62,7 @@ def table_format(units: Units) -> TableFormat:
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """The same format with the columns that options name, but for readings; lever in the unit of length."""
-    check_together(Rows, vars(rows), NEEDS)
+    Rows.check_together(vars(rows), NEEDS)
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
@@ -169,7 +169,7 @@ def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, 
     ValueError or IndexError for a value that is none.
     """
     found = dict[str, tuple[Any, list[str]]]()
-    for option in options_in(group):
+    for option in group.all():
         name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")

@@ -17,7 +17,7 @@ from diffeo_calib.campaign.journal import Journal
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
 from diffeo_calib.cli.live import Live, expected
 from diffeo_calib.cli.models import robot_of
-from diffeo_calib.cli.options import CampaignOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, measured_table
@@ -32,7 +32,7 @@ JOURNAL = ".journal"
 LOOK_SECONDS = 0.1
 
 
-def run(given: CampaignOptions) -> None:
+def run(given: Command) -> None:
     """Follow a table until the target is reached or the rows end."""
     if given.rows.by is not None or given.rows.marker is not None:
         fix = "give every row in one line of one file, with columns for each marker"
@@ -63,7 +63,7 @@ def run(given: CampaignOptions) -> None:
         raise typer.Exit(code)
 
 
-def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:
+def _followed(live: Live, given: Command, inbox: Inbox, page: Page | None) -> int:
     """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
@@ -79,7 +79,7 @@ def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | Non
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
-def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[bool]:
+def _happening(live: Live, given: Command, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
         Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()

@@ -9,13 +9,13 @@ from diffeo_calib.calibration.recalibration.compare import compare
 from diffeo_calib.cli.commands.recalibrate import change_entries, change_lines, doubt
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, provenance_lines, table_of
-from diffeo_calib.cli.options import CompareOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
 
 
-def run(given: CompareOptions) -> None:
+def run(given: Command) -> None:
     """Compare a model with new measurements, or with another model."""
     model, other = load_kinematics(given.old), given.other
     if _is_model(other):

@@ -6,7 +6,7 @@ import shlex
 
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import DemoOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.record import make_folder
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
@@ -16,7 +16,7 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 
-def run(given: DemoOptions) -> None:
+def run(given: Command) -> None:
     """Write an arm and its measurements, and calibrate it by a command that is printed."""
     make_folder(folder := given.output)
     arm = SimulatedArm(seed=given.seed)

@@ -17,7 +17,7 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.options import EvaluateOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     accept,
@@ -53,7 +53,7 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 """Of the table of residuals."""
 
 
-def run(options: EvaluateOptions) -> None:
+def run(options: Command) -> None:
     """Run the command."""
     model = load_kinematics(options.model)
     source = table_of(model, options.csv, options.rows, options.units)
@@ -132,7 +132,7 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
 
 
-def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions) -> None:
+def _registered(model: CalibratedKinematics, data: Any, options: Command) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     output = options.output
     warn_outside_range(model, data.q)

@@ -9,7 +9,7 @@ from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.options import ImagesOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together
@@ -18,7 +18,7 @@ from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.table_format import TableFormat
 
 
-def run(given: ImagesOptions) -> None:
+def run(given: Command) -> None:
     """Find the board, and write corners, cameras and overview."""
     output, table = given.output, TableFormat(given.length, "rad", given.sep, given.decimal)
     with progress_bar() as progress:

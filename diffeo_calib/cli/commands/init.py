@@ -29,7 +29,7 @@ from diffeo_calib.cli.guesses import (
     with_places,
 )
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Convention, InitOptions, Links
+from diffeo_calib.cli.options import CORNERS, Command, Convention, Links
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
@@ -77,7 +77,7 @@ class Arm(NamedTuple):
         return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how, self.lacking)
 
 
-def run(given: InitOptions) -> None:
+def run(given: Command) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     output = given.output
     if given.csv.is_dir():

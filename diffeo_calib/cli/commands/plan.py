@@ -16,7 +16,7 @@ from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_fo
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, Candidates, PlanOptions
+from diffeo_calib.cli.options import DRAWN, Candidates, Command
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format
@@ -57,7 +57,7 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
     return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
-def run(given: PlanOptions) -> None:
+def run(given: Command) -> None:
     """Plan, write the poses, and print what to expect of them."""
     cell, count, output = given.cell, given.count, given.output
     with progress_bar() as progress:
@@ -98,7 +98,7 @@ def run(given: PlanOptions) -> None:
         say(*(line for one in sensors for line in one.sentences()))
 
 
-def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
+def _robot(given: Command, table: TableFormat) -> tuple[Tree, Tensor]:
     """The robot, and the markers (P, 3) on its tip, m."""
     robot = load_robot(given.robot or Path(), given.links)
     numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]

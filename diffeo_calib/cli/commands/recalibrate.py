@@ -14,7 +14,7 @@ from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, re
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
-from diffeo_calib.cli.options import RecalibrateOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import few
@@ -22,7 +22,7 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-def run(given: RecalibrateOptions) -> None:
+def run(given: Command) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model, tests = load_kinematics(given.old), given.tests
     source = table_of(model, given.csv, given.rows, given.units)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import RecordOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_whole
@@ -16,7 +16,7 @@ from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, r
 from diffeo_calib.measurements.table_format import TableFormat, options_of
 
 
-def run(given: RecordOptions) -> None:
+def run(given: Command) -> None:
     """Find the stops, write them, and say how to go on."""
     output, offset, limits = given.output, given.offset, StopLimits(joints=given.still, shortest=given.shortest)
     joints, names, seen = read_bag(given.bag, given.joints, given.seen)

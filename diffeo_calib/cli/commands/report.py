@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
-from diffeo_calib.cli.options import ReportOptions
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import expectation_lines, parsed_length
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError
@@ -13,7 +13,7 @@ from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.report import write_report
 
 
-def run(wanted: ReportOptions) -> None:
+def run(wanted: Command) -> None:
     """Write the page, and say its first line."""
     model, data = load_kinematics(wanted.model), None
     if wanted.data is not None:
