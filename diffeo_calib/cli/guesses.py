@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 from os.path import relpath
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
@@ -21,7 +21,6 @@ from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.readings import MILLIMETRES
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
@@ -318,7 +317,7 @@ class Choice(NamedTuple):
         return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
-def entries(tables: Sequence[TableFormat], **why: str) -> Iterator[Choice]:
+def entries(tables: Sequence[Any], **why: str) -> Iterator[Choice]:
     """Fields of formats, each with its reason; where the formats differ, a remark for every value, to choose from."""
     for name, text in why.items():
         values = dict.fromkeys(getattr(table, name) for table in tables)
@@ -353,8 +352,8 @@ class RowColumns:
         """Whether the rows are corners of a board in images."""
         return any(text.startswith(CORNERS) for text in self.readings)
 
-    def entries(self) -> Iterator[Choice]:
-        """Those that name them."""
+    def entries(self, folder: Path) -> Iterator[Choice]:
+        """Those that name them, in a campaign in a folder."""
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
             yield Choice("position", names, f"{len(names)} marker(s), by their names")
@@ -370,7 +369,10 @@ class RowColumns:
             sizes = self.of_boards and not self.readings[0].endswith(".yaml")
             why += "; the lens is that of the file beside the table" * (self.of_boards and not sizes)
             why += "; width and height of the images are the least usual size that holds all corners" * sizes
-            yield Choice("reading", self.readings[0] if len(self.readings) == 1 else self.readings, why)
+            files = [text.removeprefix(CORNERS) if text.endswith(".yaml") else "" for text in self.readings]
+            pairs = zip(files, self.readings, strict=True)
+            texts = [CORNERS + relpath(file, folder) if file else text for file, text in pairs]
+            yield Choice("reading", texts[0] if len(texts) == 1 else texts, why)
         for option, name in self.named.items():
             why = f"by its name: {NAMED[option].what}"
             remounted = option == "session" and bool(self.markers)

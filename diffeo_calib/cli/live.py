@@ -68,12 +68,24 @@ class Live:
         """Go on after the lines that the journal knows."""
         known = [one for one in self.journal.entries if "line" in one]
         lines = self.table.new_lines()
-        self._check_header()
+        named = {cell.strip() for cell in self.table.cells(self.table.header)}
+        own = joint_columns(self.source.joints, self.campaign.robot)
+        joints = own.columns if isinstance(own, PoseColumns) else JointExpressions.of(own).columns
+        places = [name for name in joints if name.isdecimal() and name not in named]
+        if self.table.header and places:  # columns are named by their places, and the first line is a row
+            what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
+            got = f"the first line {few(sorted(named))}"
+            raise InputError.of(what, got=got, fix="name the columns in its first line")
         for number, entry in enumerate(known):
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
-        self._check_begun(next((one[BEGUN] for one in self.journal.entries if BEGUN in one), None))
+        begun, now = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), None), self._begun()
+        if names := [] if begun is None else [name for name in begun | now if begun.get(name) != now.get(name)]:
+            then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
+            fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
+            what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
+            raise InputError.of(what, expected=then, got=got, fix=fix)
         for line in lines[: len(known)]:
             self._keep(line)
         self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
@@ -89,18 +101,6 @@ class Live:
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
 
-    def _check_header(self) -> None:
-        """Raise InputError where columns are named by their places and the first line is a row."""
-        named = {cell.strip() for cell in self.table.cells(self.table.header)}
-        own = joint_columns(self.source.joints, self.campaign.robot)
-        joints = own.columns if isinstance(own, PoseColumns) else JointExpressions.of(own).columns
-        places = [name for name in joints if name.isdecimal() and name not in named]
-        if self.table.header and places:
-            what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
-            raise InputError.of(
-                what, got=f"the first line {few(sorted(named))}", fix="name the columns in its first line"
-            )
-
     def _begun(self) -> dict[str, str]:
         """What rows are read and judged with; of long texts their hashes."""
         robot, source = self.campaign.robot, self.source
@@ -112,16 +112,6 @@ class Live:
         found["joints"] = joint_columns(source.joints, robot)
         texts = {name: str(value) for name, value in found.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
-
-    def _check_begun(self, begun: dict[str, str] | None) -> None:
-        """Raise InputError unless the campaign was begun with the same."""
-        now = self._begun()
-        names = [] if begun is None else [name for name in begun | now if begun.get(name) != now.get(name)]
-        if begun is not None and names:
-            then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
-            fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
-            what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
-            raise InputError.of(what, expected=then, got=got, fix=fix)
 
     def new_lines(self) -> list[bytes]:
         """Lines that have not been judged."""
@@ -277,9 +267,9 @@ class Live:
     @property
     def words(self) -> tuple[str, str]:
         """The expected error with the rows to the goal, and the next poses."""
-        state = self.state()
-        more, known = state.get("more_rows", ""), expected(self.campaign)
-        needed = "" if more == "" else f", {'?' if more is None else more} more rows to the target"
+        state, known = self.state(), expected(self.campaign)
+        more = "?" if state.get("more_rows", "") is None else state.get("more_rows", "")
+        needed = "" if more == "" else f", {more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
         return f"{known[2:]}{needed}" if known else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
 

@@ -6,14 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_bank import (
-    TABLE,
-    Command,
-    Site,
-    edited,
-    rows_of,
-    set_cell,
-)
+from command_bank import TABLE, Command, Site, edited, rows_of, set_cell
 
 import diffeo_calib as dc
 

@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import (
-    ROTATION,
-    TABLE,
-    Command,
-    Site,
-    edited,
-    run_process,
-)
+from command_bank import ROTATION, TABLE, Command, Site, edited, run_process
 from server_bank import Server
 
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -94,10 +87,7 @@ def test_wrong_options(options: list[str], message: str, small_site: Site, comma
         (["--std", "a,b"], r"--std: expected names of columns: one, one per marker or three per marker"),
         (["--std", "s"], r"no column \['s'\]"),
         (["--std", "k"], r"line 2, column 'k'.*: expected a positive standard deviation, got '0'"),
-        (
-            ["--rotation", "i,j,k,l", "--convention", "quat_xyzw"],
-            r"line 2, columns i, j, k, l: .*quaternion",
-        ),
+        (["--rotation", "i,j,k,l", "--convention", "quat_xyzw"], r"line 2, columns i, j, k, l: .*quaternion"),
         (["--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5"], r"`lever`.*above 0, got -0.005"),
     ],
 )

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_bank import (
-    Command,
-    Edit,
-    Site,
-    edited,
-    rows_of,
-    set_cell,
-)
+from command_bank import Command, Edit, Site, edited, rows_of, set_cell
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 

@@ -79,8 +79,7 @@ def test_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "written",
-    [(",", ".", "mm", "deg"), (";", ",", "m", "rad"), ("\t", ".", "mm", "rad"), ("|", ",", "m", "deg")],
+    "written", [(",", ".", "mm", "deg"), (";", ",", "m", "rad"), ("\t", ".", "mm", "rad"), ("|", ",", "m", "deg")]
 )
 def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp_path: Path, command: Command) -> None:
     sep, decimal, length, angle = written
@@ -94,10 +93,7 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
     assert (done.code, done.err) == (0, "")
     assert "the nominal robot leaves, of what the rows vary" in done.out
-    words = expanded(
-        ["fit", str(out / "cell.toml")],
-        KNOWN,
-    )
+    words = expanded(["fit", str(out / "cell.toml")], KNOWN)
     options = dict(zip(words[2::2], words[3::2], strict=True))
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
     assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)

@@ -5,13 +5,7 @@ from __future__ import annotations
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import (
-    guess_joints,
-    guess_matrix,
-    guess_positions,
-    guess_rotation,
-    joints_without_column,
-)
+from diffeo_calib.cli.guesses import guess_joints, guess_matrix, guess_positions, guess_rotation, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]

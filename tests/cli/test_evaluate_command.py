@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_bank import (
-    FORMAT,
-    TABLE,
-    Command,
-    Outcome,
-    Site,
-)
+from command_bank import FORMAT, TABLE, Command, Outcome, Site
 from torch import Tensor
 
 import diffeo_calib as dc

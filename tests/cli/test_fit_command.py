@@ -8,14 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from command_bank import (
-    FORMAT,
-    STAGES,
-    Command,
-    Outcome,
-    Site,
-    make_site,
-)
+from command_bank import FORMAT, STAGES, Command, Outcome, Site, make_site
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier, parts

@@ -12,14 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_bank import (
-    Command,
-    Outcome,
-    Site,
-    environment,
-    make_site,
-    run_process,
-)
+from command_bank import Command, Outcome, Site, environment, make_site, run_process
 
 import diffeo_calib as dc
 from diffeo_calib.cli.console import Interrupts

@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_bank import (
-    FORMAT,
-    STAGES,
-    TABLE,
-    Command,
-    Outcome,
-    Site,
-)
+from command_bank import FORMAT, STAGES, TABLE, Command, Outcome, Site
 from product_bank import simulated_poses
 from server_bank import Server
 from table_bank import CONVENTIONS, read_table

@@ -102,7 +102,6 @@ def _happening(live: Live, given: Command, inbox: Inbox) -> Iterator[bool]:
 
 
 def _end(live: Live) -> None:
-    """Say how a campaign ended."""
     state = live.state() | {"ended": True}
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
