@@ -10,7 +10,7 @@ from math import inf
 from os.path import relpath
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import commanded_poses, proposals
@@ -29,7 +29,7 @@ from diffeo_calib.cli.guesses import (
     with_places,
 )
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Command, Convention, Links
+from diffeo_calib.cli.options import CORNERS, Command, Links
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
@@ -228,7 +228,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
             whole.append((Links(base=path[0].parent), [joint.name for joint in moving], ends))
     else:
         table = DHFile.read(robot)
-        ways = [None] if table.convention else get_args(Convention)
+        ways = [None] if table.convention else ("standard", "craig")
         whole += [(Links(dh_convention=way), table.names, table.names) for way in ways]
     arms = list[Arm]()
     for options, joints, ends in whole:
