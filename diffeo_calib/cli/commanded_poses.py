@@ -39,8 +39,6 @@ JOINTS = "q0", "q1"
 MOST_WAYS = 60
 """Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
-SMALLEST_M = 1e-9
-"""Extent of the places of a flange that turns at one."""
 ALIKE = 6.0
 """Ways that leave more than so many times what the best one leaves are wrong."""
 
@@ -248,7 +246,7 @@ def _alike(
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     found = list[tuple[float, tuple[Reading, Reading, bool]]]()
     place, own = commanded[0][some], torch.stack([*commanded[1].values()])[:, some]
-    size = (place - place.mean(0)).square().sum(1).mean().sqrt().clamp(min=SMALLEST_M)
+    size = max(float((own - own.mean(0)).norm(dim=1).mean()) for own in (place, seen[0][some])) or 1.0
     screws = _screws(place, own, size)
     for camera in (False, True):
         places, turns = seen[0][some], torch.stack([*seen[1].values()])[:, some]
@@ -261,7 +259,7 @@ def _alike(
     return [way for left, way in found if left <= ALIKE * found[0][0]][:MOST_WAYS]
 
 
-def _screws(places: Tensor, R: Tensor, size: Tensor) -> Tensor:
+def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
     """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
 
     Args:

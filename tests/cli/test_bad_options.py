@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import ROTATION, TABLE, Command, Site, edited, run_process
-from server_bank import Server
+from command_bank import ROTATION, TABLE, Command, Site, edited
 
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -126,17 +125,3 @@ def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command
         assert done.code == 1
         assert "this model has none" in done.error
         assert not (tmp_path / "p.csv").exists()
-
-
-def test_one_warning_and_one_sentence(small_site: Site, server: Server, tmp_path: Path) -> None:
-    done = server(small_site.fit(small_site.csv, tmp_path / "model", "--length", "m"))
-    assert done.code == 1
-    assert len(done.warnings) == 1
-    assert "positions seem to be 1000 times too large" in done.error
-
-
-@pytest.mark.slow
-def test_a_real_process_used_wrongly() -> None:
-    done = run_process("fit", "--surprise")
-    assert done.code == 2
-    assert "Traceback" not in done.err

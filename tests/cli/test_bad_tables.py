@@ -83,14 +83,6 @@ def to_the_wrist(site: Site, output: Path) -> list[object]:
     return ["wrist_link" if word == "flange" else word for word in site.fit(site.csv, output)]
 
 
-def test_joints_of_another_chain(small_site: Site, command: Command, tmp_path: Path) -> None:
-    """Six columns for the five joints that lead to the wrong tip."""
-    names = ",".join(small_site.arm.nominal.joint_names)
-    done = command(*to_the_wrist(small_site, tmp_path / "model"), "--joints", names)
-    assert done.code == 1
-    assert "expected 5 columns" in done.error
-
-
 def test_a_tip_before_the_last_joint(small_site: Site, command: Command, tmp_path: Path) -> None:
     done = command(*to_the_wrist(small_site, tmp_path / "model"))
     assert done.code == 1
@@ -136,10 +128,3 @@ def test_missing_table(small_site: Site, command: Command, tmp_path: Path) -> No
     done = command(*small_site.fit(tmp_path, tmp_path / "model"))
     assert done.code == 1
     assert "is a folder: expected a table" in done.error
-
-
-def test_brackets_in_names_are_shown(small_site: Site, command: Command, tmp_path: Path) -> None:
-    """Rich takes [red] for markup; a file or column of that name must still be named."""
-    done = command(*small_site.fit(tmp_path / "[red]x[/].csv", tmp_path / "model"))
-    assert done.code == 1
-    assert "[red]x[/].csv" in done.error

@@ -18,9 +18,7 @@ from diffeo_calib.cli.app import DECLARED as KNOWN
 from diffeo_calib.cli.app import app, expanded
 from diffeo_calib.cli.guesses import (
     guess_deviations,
-    guess_joints,
     guess_positions,
-    guess_readings,
     guess_rotation,
     guess_sheet,
 )
@@ -190,24 +188,6 @@ def test_other_devices_are_named_where_there_is_no_position(tmp_path: Path, comm
     assert "see --reading" in done.error
 
 
-def test_names_of_joints() -> None:
-    joints = ["shoulder_pan_joint", "elbow_joint"]
-    (found,) = guess_joints(["t", "elbow_joint", "shoulder_pan_joint"], joints)
-    assert found[:2] == (joints, "named as in the URDF")
-    (found, *_) = guess_joints(["Elbow Joint [deg]", "Shoulder pan joint [deg]", "x"], joints)
-    assert found.names == ["Shoulder pan joint [deg]", "Elbow Joint [deg]"]
-    assert guess_joints(["q2_rad", "q1_rad", "x"], joints)[0].names == ["q1_rad", "q2_rad"]
-    assert guess_joints(["A0", "A1", "x"], joints)[0].names == ["A0", "A1"]
-    assert not guess_joints(["q1", "q3", "x"], joints)
-    assert not guess_joints(["q1", "q2", "q3"], joints)
-
-
-def test_names_of_positions() -> None:
-    header = ["Goal x", "Goal y", "Goal z", "m_x", "m_std_x", "m_y", "m_std_y", "m_z", "m_std_z", "rx", "ry", "rz"]
-    assert guess_positions(header) == ([["m_x", "m_y", "m_z"]], [(header[:3], "wished places")])
-    assert guess_positions(["X", "Y", "Z", "x2", "y2", "z2"]) == ([["X", "Y", "Z"], ["x2", "y2", "z2"]], [])
-
-
 def test_the_ur10(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
     assert guess_sheet(ur10_folder / "measurements_iso_cubes.csv").decimal == ","
     done = command(
@@ -223,14 +203,6 @@ def test_the_ur10(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
         assert line in text
     assert "time = " not in text, "numbers that `fit` refuses"
     assert "Timestamp, Goal x" in text.splitlines()[-1]
-
-
-def test_a_table_without_numbers_is_refused(tmp_path: Path, command: Command) -> None:
-    (tmp_path / "t.csv").write_text("a,b\nhello,world\n")
-    SimulatedArm(seed=0).write_urdf(tmp_path / "arm.urdf")
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 1
-    assert "table of numbers" in done.error
 
 
 @pytest.mark.slow
@@ -369,12 +341,6 @@ def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Comma
     assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
 
 
-@pytest.mark.parametrize("before", ["t", "", "pos_", "meas."])
-def test_positions_by_usual_names(before: str) -> None:
-    names = [f"{before}{axis}" for axis in "xyz"]
-    assert guess_positions([*names, "rx", "ry", "rz", "q1"])[0] == [names]
-
-
 def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command) -> None:
     """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
     kind = kind_named("images")
@@ -400,17 +366,6 @@ def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, command: C
     assert "reading" not in written
     assert written["session"] == "session"
     assert "not used: distance" in (tmp_path / "c.toml").read_text()
-
-
-def test_columns_of_kinds_from_outside_the_package() -> None:
-    """By the name of the kind, numbered where a reading is several numbers; in the kind's own unit if one is said."""
-    assert kind_named("laser beams")  # registers both kinds
-    names = ["Line_Distance [mm]", "inclination_1_mrad", "inclination 2"]
-    assert guess_readings(names) == {
-        "line distance=Line_Distance [mm]": names[:1],
-        "inclination=inclination_1_mrad,inclination 2": names[1:],
-    }
-    assert not guess_readings(["inclination_1_deg", "inclination_2_deg", "line"])
 
 
 @pytest.mark.slow

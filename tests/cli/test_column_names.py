@@ -146,10 +146,6 @@ def test_two_markers_stay_two() -> None:
         assert guess_positions([*both[0], *both[1]]) == (both, [])
 
 
-def test_wished_places_alone_are_none() -> None:
-    assert guess_positions(triple("goal_{}")) == ([], [(triple("goal_{}"), "wished places")])
-
-
 @pytest.mark.parametrize("other", ["v{}", "gyro_{}", "rot_{}", "d{}", "force {} [N]", "sigma_{}", "q_{}"])
 def test_other_triples_are_no_places(other: str) -> None:
     assert guess_positions([*triple(other), *triple("p{}")]) == ([triple("p{}")], [])

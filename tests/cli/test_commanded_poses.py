@@ -20,7 +20,6 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv import joints
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
-from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -171,13 +170,6 @@ def test_options_that_exclude_each_other(options: list[str], message: str, tmp_p
     assert message in done.error
 
 
-def test_neither_a_robot_nor_poses(tmp_path: Path, command: Command) -> None:
-    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
-    done = command("fit", table, "--length", "mm", "--angle", "deg", "--position", "tx,ty,tz", "-o", tmp_path / "m")
-    assert done.code == 1
-    assert "expected --robot FILE, or --robot-pose COLUMNS" in done.error
-
-
 def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, command: Command) -> None:
     """Within 5 mm, or 5 m: the user says which."""
     commanded = 5.0 * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -216,13 +208,6 @@ def test_two_markers_of_a_machine_with_commanded_places(tmp_path: Path, command:
     assert found["length"] == "m"
 
 
-def test_poses_alone(tmp_path: Path, command: Command) -> None:
-    table = write_columns(tmp_path / "t.csv", x_y_z=drawn(9, 3, seed=1))
-    done = command("init", table, "-o", tmp_path / "c.toml")
-    assert done.code == 1
-    assert "expected columns beside its poses, got x, y, z alone" in done.error
-
-
 @pytest.mark.parametrize(("stated", "angle"), [("XYZ", "deg"), ("xyz", "rad"), ("rotvec", "deg")])
 def test_poses_in_another_convention_are_refused_with_the_right_one(
     stated: str, angle: str, tmp_path: Path, command: Command
@@ -233,14 +218,6 @@ def test_poses_in_another_convention_are_refused_with_the_right_one(
     done = command("fit", table, *pose, *measured, "-o", tmp_path / "m")
     assert done.code == 1
     assert "the commanded poses fit with --robot-pose X,Y,Z,RX,RY,RZ=xyz --angle deg" in done.err
-
-
-def test_a_quaternion_that_is_none(tmp_path: Path, command: Command) -> None:
-    table = write_columns(tmp_path / "t.csv", x_y_z=drawn(9, 3, seed=1), a_b_c_d=drawn(9, 4, seed=2))
-    given = ["--robot-pose", "x,y,z,a,b,c,d=quat_xyzw", "--position", "x,y,z", "--length", "m", "--angle", "rad"]
-    done = command("fit", table, *given, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert re.search(r"file '.*t\.csv': row 0 of the commanded poses: expected a quaternion", done.error)
 
 
 def test_conventions_that_the_rows_do_not_tell_apart(tmp_path: Path, command: Command) -> None:
@@ -366,32 +343,6 @@ def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, command: 
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     proposed = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
     assert not {"robot-pose", "convention", "rotation-angle"} & {*proposed}
-
-
-def test_models_of_poses_are_compared_at_the_same_poses() -> None:
-    """Their inputs are relative to the middle of the poses of each fit."""
-    models = []
-    for seed in (0, 1):
-        commanded = flange(seed)
-        measured = seen(commanded, camera_on_tool=True, seed=seed + 5)
-        if seed:
-            commanded, measured = commanded[:18], measured[:18]
-        machine = cartesian(commanded)
-        data = dc.Measurements.from_poses(dc.pose_inputs(machine, commanded), measured, camera_on_tool=True)
-        models.append(dc.calibrate(machine, data).model)
-    found = dc.compare(*models)
-    assert not found.changes.found
-    assert found.rms < 1e-3
-
-
-def test_no_row_shows_the_board(tmp_path: Path, command: Command) -> None:
-    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
-    header, *rows = cells(table)
-    lines = [header, *([*row[:-1], ""] for row in rows[::2]), *(["", *row[1:]] for row in rows[1::2])]
-    table.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
-    done = command("init", table, "-o", tmp_path / "c.toml")
-    assert done.code == 1
-    assert "no way to read them" in done.error
 
 
 def test_a_tool_is_a_rotation_vector_whatever_the_poses_are(tmp_path: Path, command: Command) -> None:

@@ -211,14 +211,6 @@ def test_wrong_options(options: list[str], message: str, site: Site, program: Pa
     assert not output.exists()
 
 
-def test_a_program_is_not_corrected_twice(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
-    path = site.folder / "model.safetensors"
-    assert command("correct", path, program, *UNITS, "-o", tmp_path / "once.csv").code == 0
-    done = command("correct", path, tmp_path / "once.csv", *UNITS, "-o", tmp_path / "twice.csv")
-    assert done.code == 1
-    assert "already has the column(s) ['command_x'" in done.error
-
-
 def recorded_misses(path: Path) -> dict[str, Any]:
     """Of a file of --json, which is as its schema says."""
     written = json.loads(path.read_text())

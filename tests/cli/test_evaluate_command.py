@@ -140,23 +140,6 @@ def test_joints_in_another_unit_are_warned_about(
     assert any("seem to be radians that were converted; check the angle unit" in text for text in done.warnings)
 
 
-def test_predict_in_metres_from_joints_alone(
-    fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    q = site.data.q[:3]
-    lines = [",".join(f"q{i}" for i in range(6)), *(",".join(map(repr, row)) for row in q.tolist())]
-    (tmp_path / "path.csv").write_text("\n".join(lines))
-    names = ["--joints", "q0,q1,q2,q3,q4,q5", "--length", "m", "--angle", "rad"]
-    done = command(
-        "predict", site.folder / "model.safetensors", tmp_path / "path.csv", *names, "-o", tmp_path / "p.csv"
-    )
-    assert done.code == 0
-    values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
-    assert np.array_equal(values[:, :6], q.numpy())
-    assert np.array_equal(values[:, 6:9], model.predict(q)[0][:, 0].numpy())  # all digits are written
-
-
 def test_blocks_do_not_change_predictions_or_errors(
     fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,6 @@ from kind_bank import kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -149,15 +148,6 @@ def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(tmp_path: 
         fitted = command("fit", tmp_path / table, "--robot", tmp_path / robot, *units)
         assert asked.error == fitted.error
         assert message in asked.error
-
-
-def test_a_chain_with_one_end_needs_no_links(tmp_path: Path) -> None:
-    write_arm(tmp_path, [])
-    robot = dc.load_urdf(tmp_path / "arm.urdf")
-    assert (robot.base, robot.tip) == ("base_link", "flange")
-    write_arm(tmp_path, GRIPPER)
-    with pytest.raises(InputError, match=r"`tip` of .* expected one link at this end, got left_jaw, right_jaw"):
-        dc.load_urdf(tmp_path / "arm.urdf")
 
 
 ROWS = [(0.07, -pi / 2, 0.41, 0.0), (0.5, 0.0, 0.0, -pi / 2), (0.04, -pi / 2, 0.0, 0.0)]

@@ -107,15 +107,6 @@ def test_other_commands_name_the_ball_and_what_was_measured(
     assert 0 < float(said[2]) < 0.5 * float(said[1])
 
 
-def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    data = read()
-    assert data.line_numbers.tolist() == list(range(2, 25))
-    assert data.places is not None
-    assert (data.places >= 0).nonzero()[:, 0].tolist() == list(range(3, 15))
-    assert len(data.device_rows()) == TRACKED
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -134,16 +125,6 @@ def test_lines_of_one_kind(
         read("wrong.csv")
 
 
-def test_tables_of_one_kind_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    header, *lines = (folder / "t.csv").read_text().split("\n")
-    for start, message in (("", "no line holds a socket"), ("spot", "columns x, y, z: empty in all 12 lines")):
-        kept = [line for line in lines if line.startswith("spot") == bool(start)]
-        (folder / "one.csv").write_text("\n".join([header, *kept]))
-        with pytest.raises(MeasurementError, match=message):
-            read("one.csv")
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -160,17 +141,6 @@ def test_refused_options(
     assert message in " ".join(done.err.split())
     done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS[:-2], "-o", "none.safetensors")
     assert "--distance without --distance-std" in done.err
-
-
-def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    header, *lines = (folder / "t.csv").read_text().split("\n")
-    days = ["" if line.startswith("spot") else "ab"[number % 2] for number, line in enumerate(lines)]
-    with_days = [f"{line},{day}" for line, day in zip(lines, days, strict=True)]
-    (folder / "days.csv").write_text("\n".join([f"{header},day", *with_days]))
-    data = read("days.csv", session="day")
-    assert data.session is not None
-    assert [data.session_names[k] if k >= 0 else "" for k in data.session.tolist()] == days
 
 
 def test_set_ups_are_evaluated_each_in_its_place(

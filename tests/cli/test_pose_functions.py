@@ -88,13 +88,6 @@ def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.Monke
     )
 
 
-def test_a_function_is_named_with_its_columns(tmp_path: Path, command: Command) -> None:
-    table = write_columns(tmp_path / "t.csv", q1_q2_q3=drawn(9, 3, seed=1), x_y_z=drawn(9, 3, seed=2))
-    done = command("fit", table, "--robot", "own.py:f", *MEASURED, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert "--robot-pose A,B,...=own.py:f" in done.error
-
-
 def test_a_campaign_file_names_a_function_beside_it(delta: Path, tmp_path: Path, command: Command) -> None:
     entries = {"csv": "delta.csv", "robot-pose": "q1,q2,q3=my_delta.py:kinematics", "position": "x,y,z"}
     lines = [f'{name} = "{value}"' for name, value in {**entries, "length": "mm", "angle": "deg"}.items()]

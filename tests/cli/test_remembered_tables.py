@@ -8,11 +8,9 @@ from typing import Any
 import pytest
 from command_bank import Command
 from kind_bank import Kind, kind_named
-from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
-from diffeo_calib.cli.commands.correct import REASONS
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import rows_in_table
 from diffeo_calib.sensors.set_ups import MeasuringFrames
@@ -41,13 +39,6 @@ def test_rows_of_one_session_are_judged_in_its_frame() -> None:
         assert new.rms < 1.2 * found.rms
 
 
-def test_devices_of_readings_are_no_sessions() -> None:
-    kind = kind_named("several kinds")
-    same = kind.result.aligned(kind.data)
-    assert [part.kind for part in same.parts] == [part.kind for part in kind.data.parts]
-    assert_close(same.parts[0].points, kind.data.parts[0].points, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("name", ["distances", "several kinds"])
 def test_plans_keep_the_names_of_devices(name: str) -> None:
     """Of two kinds with the same names the kind is said too."""
@@ -72,10 +63,6 @@ def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
     assert rows_in_table(path, rows, UNITS)[0] == Rows(reading=["image=u,v,9,9,1,1"], session="day")
     path.write_text("q1,a\n1,2\n")
     assert rows_in_table(path, rows, UNITS) == (rows, [])  # a table of other columns: the reader says so
-
-
-def test_a_correction_that_the_limit_refuses_is_named() -> None:
-    assert all("--limit" in REASONS[status] for status in ("singular", "unreachable"))
 
 
 def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: Any) -> None:

@@ -48,13 +48,6 @@ def test_from_the_measured_frame(posed: Case, files: Path, command: Command) -> 
     torch.testing.assert_close(model.tool_poses(q, tool)[reached], expected, rtol=0, atol=1e-8)
 
 
-def test_measured_frame_is_that_of_the_measurements(posed: Case) -> None:
-    """In the measuring frame the poses of the measured frame as a tool are those of the model."""
-    model, q = posed.model, posed.test.q[:8]
-    poses = model.tool_poses(q, model.measured_frame, "measuring")
-    assert float((poses - model.poses(q)).abs().max()) < 1e-6  # both nearest to slightly bent triangles
-
-
 @pytest.mark.slow
 def test_exported_programs(posed: Case, files: Path, command: Command) -> None:
     text, model = ",".join(map(str, TOOL)), str(files / "model.safetensors")
