@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_bank import Command
@@ -129,20 +130,16 @@ def test_a_robot_that_explains_nothing_is_refused(tmp_path: Path, command: Comma
     assert not (tmp_path / "cell.toml").exists()
 
 
-def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
+def test_sockets_are_proposed(tmp_path: Path, init: Any) -> None:
     """Angles in degrees, known by the ball; distances are for the user to fill in."""
     arm = SimulatedArm(seed=1)
     arm.write_urdf(tmp_path / "arm.urdf")
     write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "c.toml").read_text()
-    written = tomllib.loads(text)
+    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
     assert written["socket"] == ["place", "socket"]
     assert (written["angle"], written["length"]) == ("deg", "mm")
     assert not {"position", "distance", "distance-std"} & set(written)
     assert "# all columns are used" in text
-    assert "fill in the lines that say `uncomment`, then run" in done.err + done.out
     filled = tomllib.loads(text.replace("# distance", "distance"))
     assert filled["distance"] == ["a,b=50"]
     words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], KNOWN)
@@ -150,15 +147,14 @@ def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
     assert words[words.index("--distance") + 1] == "a,b=50"
 
 
-def test_sockets_of_a_panda(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
+def test_sockets_of_a_panda(ur10_folder: Path, tmp_path: Path, init: Any) -> None:
     """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
     data = ur10_folder.parent / "mukca"
-    done = command("init", data / "panda_3.csv", data / "panda.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
+    init(data / "panda_3.csv", data / "panda.urdf")
     assert tomllib.loads((tmp_path / "c.toml").read_text())["angle"] == "rad"
 
 
-def test_sockets_beside_positions_are_proposed_in_the_unit_of_these(tmp_path: Path, command: Command) -> None:
+def test_sockets_beside_positions_are_proposed_in_the_unit_of_these(tmp_path: Path, init: Any) -> None:
     arm = SimulatedArm(seed=1)
     arm.write_urdf(tmp_path / "arm.urdf")
     write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
@@ -167,9 +163,7 @@ def test_sockets_beside_positions_are_proposed_in_the_unit_of_these(tmp_path: Pa
     seen = [["", "", *map(repr, [*a, *p])] for a, p in zip(q.rad2deg().tolist(), points[:, 0].tolist(), strict=True)]
     lines = [f"{header},x,y,z", *map(",".join, seen), *(f"{row},,," for row in rows)]
     (tmp_path / "t.csv").write_text("\n".join(lines))
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "c.toml").read_text()
+    _, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
     written = tomllib.loads(text.replace("# distance", "distance"))
     assert (written["position"], written["socket"]) == (["x,y,z"], ["place", "socket"])
     assert (written["angle"], written["length"]) == ("deg", "m")
@@ -217,16 +211,14 @@ def test_the_ur10(ur10_folder: Path, tmp_path: Path, command: Command) -> None:
     ],
 )
 def test_rotations_are_proposed_in_the_convention_that_fits(
-    convention: str, unit: str | None, names: list[str], tmp_path: Path, command: Command
+    convention: str, unit: str | None, names: list[str], tmp_path: Path, init: Any
 ) -> None:
     arm, data, _ = simulated_poses(40)
     arm.write_urdf(tmp_path / "arm.urdf")
     table = TableFormat("mm", "deg", rotation=names, convention=convention, rotation_angle=unit)
     position = ("m_x", "m_y", "m_z") if names[0].startswith("m_") else ("x", "y", "z")
     write_measurements(tmp_path / "t.csv", data, table, position=position)
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
     assert written["rotation"] == ",".join(names)
     assert written["convention"] == convention
     assert written.get("rotation-angle") == unit
@@ -234,16 +226,14 @@ def test_rotations_are_proposed_in_the_convention_that_fits(
     assert {f"--{name}" for name in written} - {"--csv"} <= set(known)
 
 
-def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, command: Command) -> None:
+def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, init: Any) -> None:
     arm, data, _ = simulated_poses(40)
     arm.write_urdf(tmp_path / "arm.urdf")
     turned = data.rows([*range(1, 40), 0])
     mixed = dc.Measurements(data.q, data.points[:, 0], data.joint_names).to_frame()
     mixed[["rx", "ry", "rz"]] = turned.to_frame()[["rx", "ry", "rz"]].to_numpy()
     mixed.to_csv(tmp_path / "t.csv", index=False)
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "c.toml").read_text()
+    _, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
     assert "rotation =" not in text
     assert "# rx, ry, rz: rotations of no convention that is clearly better than others; not used" in text
     assert "such names usually mean a rotation vector, or angles about x, y and z" in text
@@ -294,13 +284,11 @@ def test_an_edited_file_is_kept(tmp_path: Path, command: Command) -> None:
 
 
 @pytest.mark.slow
-def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> None:
+def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command, init: Any) -> None:
     arm = SimulatedArm(seed=3)
     arm.write_urdf(tmp_path / "arm.urdf")
     write_wire_table(tmp_path / "wire.csv", arm, seed=1)
-    done = command("init", tmp_path / "wire.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "c.toml").read_text()
+    _, text = init(tmp_path / "wire.csv", tmp_path / "arm.urdf")
     assert 'reading = "displacement=wire"' in text
     assert 'session = "anchor"' in text
     assert 'length = "mm"' in text
@@ -309,8 +297,7 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
     frame["payload_kg"] = [0.0, 2.0] * 20
     frame["time_s"], frame["Temperature"] = range(40), [21.5] * 40
     frame.to_csv(tmp_path / "t.csv", index=False)
-    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "d.toml").code == 0
-    proposed = tomllib.loads((tmp_path / "d.toml").read_text())
+    proposed, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf", name="d.toml")
     assert {name: proposed[name] for name in ("payload", "time", "temperature")} == {
         "payload": "payload_kg",
         "time": "time_s",
@@ -324,13 +311,11 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
-def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Command) -> None:
+def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, init: Any) -> None:
     """The options that `init` writes read the table as those that wrote it."""
     kind = kind_named(name)
     table, options = kind.table()
-    done = command("init", table, kind.urdf, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    written, _ = init(table, kind.urdf)
     given: dict[str, list[str]] = {}
     for word, value in zip(options, [*options[1:], ""], strict=True):
         if word.startswith("--"):
@@ -341,19 +326,18 @@ def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Comma
     assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
 
 
-def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command) -> None:
+def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command, init: Any) -> None:
     """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
     kind = kind_named("images")
     table, _ = kind.table()
-    assert command("init", table, kind.urdf, "-o", tmp_path / "c.toml").code == 0
-    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    written, _ = init(table, kind.urdf)
     assert (written["reading"], written["session"], written["angle"]) == ("image=u,v,FX,FY,CX,CY", "session", "deg")
     refused = command("fit", tmp_path / "c.toml")
     assert refused.code == 1
     assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
 
 
-def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, command: Command) -> None:
+def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, init: Any) -> None:
     """Rows of several kinds leave the cells of the other kinds empty."""
     arm = SimulatedArm(seed=3)
     arm.write_urdf(tmp_path / "arm.urdf")
@@ -361,8 +345,7 @@ def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, command: C
     frame["distance"] = 1.0
     frame["session"] = ["monday", "tuesday"] * 20
     frame.to_csv(tmp_path / "t.csv", index=False)
-    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml").code == 0
-    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
     assert "reading" not in written
     assert written["session"] == "session"
     assert "not used: distance" in (tmp_path / "c.toml").read_text()

@@ -138,21 +138,3 @@ def test_ctrl_c_in_a_real_process_writes_the_model(moment: str, tmp_path: Path) 
         1e3 * dc.evaluate(model, test).rms, abs=1.01e-4
     )
     assert done.numbers("calibrated", "24 held out")[0] < done.numbers("geometric", "24 held out")[0]
-
-
-CUT_SHORT = """
-import os, signal, sys
-from importlib import import_module
-from diffeo_calib.__main__ import main
-
-module, name = import_module(sys.argv.pop(1)), sys.argv.pop(1)
-called = getattr(module, name)
-
-def cut_short(*given, **options):
-    print("reached", flush=True)
-    os.kill(os.getpid(), signal.SIGINT)
-    return called(*given, **options)
-
-setattr(module, name, cut_short)
-main()
-"""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -79,26 +79,17 @@ def test_two_files_are_read_as_one(files: Files, capsys: pytest.CaptureFixture[s
     assert "1 of joints.csv (P29)" in capsys.readouterr().out
 
 
-def test_init_finds_the_column_of_the_markers(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.whole, files.urdf, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in done.out
-    assert 'length = "mm"' in done.out
+def test_init_finds_the_column_of_the_markers(files: Files, init: Any) -> None:
+    written, text = init(files.whole, files.urdf)
+    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in text
+    assert written["length"] == "mm"
 
 
-def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    assert (
-        'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in done.out
-    )
-    for words in (
-        'places.csv"  # the measured places',
-        'marker = "reflector"',
-        'length = "mm"',
-        "# all columns are used",
-    ):
-        assert words in done.out
+def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
+    _, text = init(files.joints, files.urdf, "--places", files.places)
+    assert 'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in text
+    for words in ('places.csv"  # the measured', 'marker = "reflector"', 'length = "mm"', "# all columns are used"):
+        assert words in text
     assert command("fit", tmp_path / "c.toml", "--position", "x").err.endswith("expected three columns X,Y,Z, got x\n")
 
 
@@ -142,9 +133,9 @@ def test_options_that_do_not_go_together(words: list[str], message: str, files: 
 
 
 @pytest.mark.slow
-def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command) -> None:
+def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
     """From two files to a model, and to the errors of a table of some markers in another order."""
-    assert command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml").code == 0
+    init(files.joints, files.urdf, "--places", files.places)
     done = command("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
     assert done.code == 0, done.err
     header, *lines = files.whole.read_text().splitlines()
