@@ -60,18 +60,6 @@ def test_a_model_s_joints_missing_in_the_table(
 PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
 
 
-@pytest.mark.parametrize("case", PLACES)
-def test_predictions_that_cannot_be_written(
-    case: tuple[str, str], small_site: Site, sound: bytes, command: Command, tmp_path: Path
-) -> None:
-    place, message = case
-    (tmp_path / "model").write_bytes(sound)
-    (tmp_path / "here.png").mkdir()
-    done = command("predict", tmp_path / "model", small_site.csv, *TABLE[2:], "-o", tmp_path / place)
-    assert done.code == 1
-    assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
-
-
 @pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
 def test_outputs_are_checked_before_the_fit(
     case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

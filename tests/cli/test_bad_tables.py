@@ -65,19 +65,6 @@ def test_shuffled_rows(small_site: Site, command: Command, tmp_path: Path) -> No
     assert (tmp_path / "model").exists()
 
 
-def test_many_columns_are_cut_short(small_site: Site, command: Command, tmp_path: Path) -> None:
-    many = [f"extra{k}" for k in range(40)]
-    csv = edited(
-        small_site, tmp_path / "t.csv", lambda cells: [cells[0] + many, *(row + ["0"] * 40 for row in cells[1:])]
-    )
-    at = (given := small_site.fit(csv, tmp_path / "model")).index("--position")
-    done = command(*given[:at], *given[at + 2 :], "--position", "mx,my,height")
-    assert done.code == 1
-    assert "got the columns ['waist_joint', " in done.error
-    assert "'extra2' and 37 more]; " in done.error
-    assert "extra3" not in done.error
-
-
 def to_the_wrist(site: Site, output: Path) -> list[object]:
     """Arguments of `fit` with a tip before the last joint."""
     return ["wrist_link" if word == "flange" else word for word in site.fit(site.csv, output)]

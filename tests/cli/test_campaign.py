@@ -102,21 +102,6 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     assert (options["--base"], options["--tip"]) == ("base_link", "flange")
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_the_proposal_runs(tmp_path: Path, command: Command) -> None:
-    arm = SimulatedArm(seed=3)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    data = dc.Measurements(*arm.measure(50, seed=0), arm.nominal.joint_names)
-    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"), position=("x", "y", "z"))
-    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "cell.toml").code == 0
-    done = command("fit", tmp_path / "cell.toml", "--holdout", "0")
-    assert done.code == 0, done.err
-    model = dc.load(tmp_path / "t.safetensors")
-    assert len(model.configurations) == 50
-    assert (tmp_path / "t.html").is_file()
-
-
 def test_a_robot_that_explains_nothing_is_refused(tmp_path: Path, command: Command) -> None:
     arm, other = SimulatedArm(seed=3), SimulatedArm(seed=4)
     arm.write_urdf(tmp_path / "arm.urdf")
@@ -169,17 +154,6 @@ def test_sockets_beside_positions_are_proposed_in_the_unit_of_these(tmp_path: Pa
     assert (written["angle"], written["length"]) == ("deg", "m")
     assert written["distance"] == ["a,b=0.05"]
     assert float(written["distance-std"]) == 3e-5
-
-
-def test_other_devices_are_named_where_there_is_no_position(tmp_path: Path, command: Command) -> None:
-    arm = SimulatedArm(seed=1)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    write_wire_table(tmp_path / "t.csv", arm, 1)
-    named = (tmp_path / "t.csv").read_text().replace(",wire,", ",measured,")
-    (tmp_path / "t.csv").write_text(named)
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
-    assert done.code == 1
-    assert "see --reading" in done.error
 
 
 def test_the_ur10(ur10_folder: Path, tmp_path: Path, command: Command) -> None:

@@ -159,23 +159,6 @@ def test_blocks_do_not_change_predictions_or_errors(
     assert printed[0] == printed[1]
 
 
-def test_a_mistake_in_the_last_row_is_found_before_the_first_is_used(
-    fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert fitted.code == 0
-    monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", 7)
-    monkeypatch.setattr(dc.CalibratedKinematics, "predict", lambda *_: pytest.fail("the work has begun"))
-    (tmp_path / "old.csv").write_text("old")
-    (tmp_path / "bad.csv").write_text(site.csv.read_text() + "1;2;far;4;5;6;7;8;9\n")
-    done = command(
-        "predict", site.folder / "model.safetensors", tmp_path / "bad.csv", *TABLE[2:], "-o", tmp_path / "old.csv"
-    )
-    assert done.code == 1
-    assert "bad.csv', line 42, column " in done.error
-    assert (tmp_path / "old.csv").read_text() == "old"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "old.csv"]
-
-
 def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, command: Command) -> None:
     assert fitted.code == 0
     arguments = ["evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--fail-above"]

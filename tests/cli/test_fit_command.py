@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from command_bank import FORMAT, STAGES, Command, Outcome, Site, make_site
+from command_bank import FORMAT, STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier, parts
@@ -141,34 +141,6 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert loaded.report["rows"] == 20
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
     assert "20 training rows, no row was held out" in (tmp_path / "all.svg").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_two_markers(command: Command, tmp_path: Path) -> None:
-    site = make_site(tmp_path, rows=16, markers=2)
-    table = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
-    markers = ["--position", "x0,y0,z0", "--position", "x1, y1 ,z1"]
-    path = tmp_path / "two.safetensors"
-    done = command("fit", site.csv, *site.robot(), *markers, *table, "-o", path, "--holdout", 0)
-    assert (done.code, done.err.strip()) == (0, "")
-    evaluated = command("evaluate", path, site.csv, *markers, *table)
-    assert evaluated.numbers("in all") == pytest.approx(done.numbers("calibrated", "training"), abs=1.01e-4)
-    predicted = command("predict", path, site.csv, *table, "-o", tmp_path / "p.csv")
-    assert predicted.code == 0
-    header = (tmp_path / "p.csv").read_text().splitlines()[0].split(";")
-    kinds = [f"{kind}{axis}" for kind in ("", "std_") for axis in "xyz"]
-    assert header == [*site.arm.nominal.joint_names, *(f"marker{k}_{kind}" for k in (1, 2) for kind in kinds)]
-    crossed = command("evaluate", path, site.csv, *reversed_markers(markers), *table)
-    assert crossed.numbers("in all")[0] > 10.0  # markers in the wrong order are not the same markers
-    assert len(crossed.warnings) == 1
-    fewer = command("evaluate", path, site.csv, *markers[:2], *table)
-    assert fewer.code == 1
-    assert "do not have the same markers" in fewer.error
-
-
-def reversed_markers(markers: list[str]) -> list[str]:
-    return [*markers[2:], *markers[:2]]
 
 
 def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Command) -> None:

@@ -194,35 +194,6 @@ def test_the_convention_that_explains_the_rows(convention: str, scale: float, tm
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_the_proposal_for_a_dh_table_runs(tmp_path: Path, command: Command) -> None:
-    write_dh_arm(tmp_path, "craig", 1e3, "joint_{}", TableFormat("m", "rad"))
-    assert command("init", tmp_path / "t.csv", tmp_path / "arm.csv", "-o", tmp_path / "c.toml").code == 0
-    done = command("fit", tmp_path / "c.toml", "--holdout", "0")
-    assert done.code == 0, done.err
-    model = dc.load(tmp_path / "t.safetensors")
-    assert (model.robot.name, model.robot.joint_names[0], len(model.configurations)) == ("arm", "joint_1", 40)
-    planned = command(
-        "plan",
-        "-n",
-        "6",
-        "--robot",
-        tmp_path / "arm.csv",
-        "--dh-convention",
-        "craig",
-        "--draw",
-        "50",
-        "--length",
-        "mm",
-        "--angle",
-        "deg",
-        "-o",
-        tmp_path / "plan.csv",
-    )
-    assert planned.code == 0, planned.err
-
-
 def test_a_last_row_without_a_joint_and_options_that_do_not_belong(tmp_path: Path, command: Command) -> None:
     """The row of a flange has no column; the tip is before it."""
     write_dh_arm(tmp_path, "standard", 1.0, "joint_{}", TableFormat("mm", "deg"))

@@ -8,7 +8,6 @@ from typing import Any
 
 import jsonschema
 import pytest
-import torch
 from command_bank import Command
 from product_bank import Case
 
@@ -70,20 +69,6 @@ def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
     assert ran(command, folder, "predict", model, "new.csv", *UNITS, "-o", "p.csv")["results"]["rows"] == 30
     exported = ran(command, folder, "export", model, "--dh", "dh.csv")["results"]
     assert exported["files"] == {"dh": str(folder / "dh.csv")}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales", "undrawn")
-def test_fit(folder: Path, command: Command) -> None:
-    written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
-    assert set(written["errors"]) == {"training", "held_out"}
-    assert written["errors"]["held_out"]["calibrated"]["rows"] == 12
-    assert set(written["files"]) == {"model", "figure", "report"}
-    model = dc.load(folder / "demo" / "model.safetensors")
-    torch.testing.assert_close(torch.tensor(written["base"], dtype=torch.float64), model.geometry.base)
-    assert model.provenance is not None
-    assert model.provenance.command.startswith("diffeo-calib fit ")
-    assert "--report" in model.provenance.command
 
 
 def test_an_error_is_written_too(folder: Path, command: Command) -> None:

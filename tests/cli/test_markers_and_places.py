@@ -6,20 +6,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import torch
 from command_bank import Command
-from torch.testing import assert_close
 
 from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows, Units
-from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
+from diffeo_calib.cli.tables import as_at_the_fit
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 FIT = "diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --places p.csv --by name -o m"
-UNITS = Units(length="mm", angle="deg")
 ARM = SimulatedArm(seed=2, markers=3)
 ROWS = 30
 
@@ -64,19 +61,6 @@ def test_the_file_of_places_is_that_of_its_table() -> None:
     assert rows == Rows(position=["x,y,z"])
     rows, _ = as_at_the_fit(FIT, Rows(places=Path("new.csv")), Units())
     assert rows == Rows(position=["x,y,z"], places=Path("new.csv"), by="name")
-
-
-def test_two_files_are_read_as_one(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top")
-    whole = measured_table(files.whole, rows, UNITS).read(ARM.nominal)
-    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top", places=files.places, by="name")
-    assert rows_in_table(files.joints, rows, UNITS) == (rows, [])
-    both = measured_table(files.joints, rows, UNITS).read(ARM.nominal)
-    back = torch.arange(ROWS - 2, -1, -1)
-    assert_close(both.q, whole.q[back], rtol=0, atol=0)
-    assert_close(both.points, whole.points[back], rtol=0, atol=0, equal_nan=True)
-    assert both.line_numbers.tolist() == [*range(2, ROWS + 1)]
-    assert "1 of joints.csv (P29)" in capsys.readouterr().out
 
 
 def test_init_finds_the_column_of_the_markers(files: Files, init: Any) -> None:

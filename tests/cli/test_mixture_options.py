@@ -47,41 +47,6 @@ def read(path: Path | str = "t.csv", **options: object) -> dc.Measurements:
     return dc.read_measurements(path, robot, ["x", "y", "z"], **given)  # pyright: ignore[reportArgumentType]
 
 
-def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    fitted = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, "-o", "m.safetensors", "--json", "m.json")
-    assert fitted.code == 0, fitted.err
-    assert "Position errors in mm by stage" in fitted.out
-    assert "8 training" in fitted.out
-    assert "3 held out" in fitted.out
-    assert "mm in the measuring frame" in fitted.out
-    assert "marker in the frame of 'flange'" in fitted.out
-    assert "ball in the frame of 'flange'" in fitted.out
-    assert "2 to 6 times" not in fitted.out
-    results = json.loads((folder / "m.json").read_text())["results"]
-    assert len(results["sockets"]["positions_m"]) == 4
-    assert results["errors"]["training"]["calibrated"]["rows"] == 8
-    done = command("evaluate", "m.safetensors", "t.csv", *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
-    assert done.code == 0, done.err
-    assert "3 not used in the fit" in done.out
-    assert "12 in all" in done.out
-    assert done.out.count("known 50.000") == 2
-    model = dc.load("m.safetensors")
-    assert isinstance(model, dc.CalibratedKinematics)
-    rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
-    data = read()
-    assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
-    spread = json.loads(Path("e.json").read_text())["results"]["kinds"]["socket"]["all"]
-    assert (spread["rows"], spread["what"], spread["unit"]) == (12, "spread", "mm")
-    assert spread["rms"] == pytest.approx(1e3 * dc.evaluate(model, data.socket_rows()).rms, rel=1e-9)
-    (folder / "tracked.csv").write_text(
-        "\n".join(line for line in (folder / "t.csv").read_text().split("\n") if not line.startswith("spot"))
-    )
-    alone = command("evaluate", "m.safetensors", "tracked.csv", *POSITION, *UNITS, "--json", "a.json")
-    assert alone.code == 0, alone.err
-    assert json.loads(Path("a.json").read_text())["results"]["errors"]["all"]["rms_m"] == pytest.approx(rms, rel=1e-9)
-
-
 def test_other_commands_name_the_ball_and_what_was_measured(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,6 @@ from two_arms_bank import HANDS, TwoArms, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.interop.torch_program import TorchProgram
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.pose_frames import points_of_frames
 
@@ -75,16 +74,6 @@ def test_fit_says_where_frames_are_and_what_was_hidden(case: Case) -> None:
     assert_close(places, case.arms.frames[:, :3, 3], rtol=0, atol=2e-3)
 
 
-def test_measured_frames_are_tools(case: Case) -> None:
-    """Poses by two other paths: any tool, placed where the frames were found, and a program in torch."""
-    model, q = case.model, case.new.q[:9]
-    poses = model.poses(q)
-    assert_close(TorchProgram(model, "poses")(q), poses, rtol=0, atol=1e-10)
-    for k, side in enumerate(HANDS):
-        frame = model.measured_frame[k]
-        assert_close(model.tool_poses(q, frame, "measuring", side), poses[:, k], rtol=0, atol=1e-9)
-
-
 def test_evaluate_and_residuals(case: Case, command: Command, tmp_path: Path) -> None:
     to = ["--residuals", tmp_path / "r.csv", "--json", tmp_path / "r.json"]
     done = command("evaluate", case.path, case.folder / "new.csv", *TABLE, *to)
@@ -132,11 +121,6 @@ def test_other_tips_and_other_kinds_are_refused(case: Case) -> None:
         dc.evaluate(case.model, dc.Measurements(case.new.q, points))
     with pytest.raises(MeasurementError, match=says("has 2 tips", "from_poses(..., on=[...])")):
         dc.calibrate(case.arms.nominal, case.new.with_tips(None))
-
-
-def test_exchanged_hands_are_found(case: Case) -> None:
-    with pytest.raises(MeasurementError, match="on 'left' and 'right' seem to be exchanged"):
-        dc.calibrate(case.arms.nominal, case.new.with_tips(HANDS[::-1]))
 
 
 def test_a_rotation_for_each_position(case: Case, command: Command) -> None:
