@@ -100,18 +100,6 @@ def test_wrong_rotations(options: list[str], message: str, small_site: Site, com
     assert not (tmp_path / "model").exists()
 
 
-def test_rotations_in_the_wrong_unit_cause_a_warning(small_site: Site, command: Command, tmp_path: Path) -> None:
-    csv = edited(
-        small_site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"123"] for r in cells[1:])]
-    )
-    done = command(
-        "fit", csv, *small_site.fit(csv, tmp_path / "model")[2:], "--rotation", "i,j,k", *ROTATION[2:], "--lever", "0"
-    )
-    assert done.code == 1
-    assert "rotations reach only 3 deg" in done.warnings[0]
-    assert "pass --rotation-angle 'rad'" in done.warnings[0]
-
-
 def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
     (tmp_path / "model").write_bytes(sound)
     csv = edited(

@@ -126,20 +126,6 @@ def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, co
     np.testing.assert_allclose(values[:, 9:], 1e3 * deviations, rtol=1e-6)
 
 
-@pytest.mark.parametrize("verb", ["predict", "correct"])
-def test_joints_in_another_unit_are_warned_about(
-    verb: str, fitted: Outcome, site: Site, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    names, q = site.arm.nominal.joint_names, site.data.q[:12]
-    path = tmp_path / "joints.csv"
-    path.write_text("\n".join([",".join(names), *(",".join(map(str, row)) for row in q.tolist())]))
-    words = ["--length", "mm", "--angle", "deg", "-o", tmp_path / "out.csv"]
-    done = command(verb, site.folder / "model.safetensors", path, *words)
-    assert done.code == 0
-    assert any("seem to be radians that were converted; check the angle unit" in text for text in done.warnings)
-
-
 def test_blocks_do_not_change_predictions_or_errors(
     fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

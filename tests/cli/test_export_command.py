@@ -74,23 +74,6 @@ def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, co
     assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
 
 
-@pytest.mark.slow
-def test_rigid_kinematics_for_use_with_tables(
-    path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
-    urdf, tables = ["--urdf", tmp_path / "a.urdf"], ["--correction-tables", tmp_path / "t.csv"]
-    done = command("export", path, *urdf, *tables, "--with-tables")
-    assert (done.code, done.err.strip()) == (0, "")
-    made = dc.interop.rigid_kinematics(model, transmission=True)
-    chain = dc.load_urdf(tmp_path / "a.urdf", "base_link", "flange")
-    q = configurations(chain)
-    torch.testing.assert_close(chain(q), own_poses(made.geometry, q), rtol=0, atol=1e-12)
-    together, alone = row(done, "--urdf and --correction-tables"), row(done, "--urdf alone")
-    assert together[0] == pytest.approx(1e3 * made.rms, abs=1e-4)
-    assert together[0] < row(command("export", path, *urdf, *tables), "--urdf and --correction-tables")[0]
-    assert alone[0] > row(command("export", path, *urdf), "--urdf")[0]
-
-
 def test_only_universal_robots_have_their_file(path: Path, command: Command, tmp_path: Path) -> None:
     done = command("export", path, "--urdf", tmp_path / "a.urdf", "--ur-kinematics", tmp_path / "ur.yaml")
     assert done.code == 1
