@@ -128,18 +128,18 @@ def _declare(name: str, options: type[Command]) -> None:
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
     def run(_json: Any, **given: Any) -> None:
-        made = options.made(given)
-        written, read, appended = dict(made.more_files), dict[str, Path](), dict[str, Path]()
-        files = {"output": written, "file": read, "files": read, "table": appended}
+        written, read, appended = dict[str, Path](), dict[str, Path](), dict[str, Path]()
+        files = {"output": written, "source": written, "file": read, "files": read, "table": appended}
         for one in own:
             value = given[one.field]
             for path in value if isinstance(value, list) else [value]:
                 if one.kind in files and path is not None:
                     files[one.kind][one.shown + f" {path}" * isinstance(value, list)] = path
+                    if one.kind == "source":
+                        written[f"{one.shown} (its header)"] = path.with_suffix(".h")
         check_outputs(written, read | appended, may_come=appended)
-        options.check_together(given, made.needs, made.beside)
-        made.check()
-        import_module(f"diffeo_calib.cli.commands.{name}").run(made)
+        options.check_together(given)
+        import_module(f"diffeo_calib.cli.commands.{name}").run(options.made(given))
 
     for one in own:
         typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
@@ -147,7 +147,7 @@ def _declare(name: str, options: type[Command]) -> None:
         kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
         parameters.append(inspect.Parameter(one.field, kind, default=default, annotation=annotation))
     parameters.append(inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json))
-    run.__name__, run.__doc__ = f"{name}_command", description()[name][0]
+    run.__name__, run.__doc__ = f"{name}_command", description()[name].text
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(run)["__signature__"] = inspect.Signature(parameters)
     app.command(name)(run)

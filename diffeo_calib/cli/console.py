@@ -18,10 +18,9 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
-from rich.text import Text
 
 from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
 from diffeo_calib.common.errors import PACKAGE, few, printable
@@ -78,7 +77,7 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
     Python users pass it on too: ``with progress_bar() as progress: dc.calibrate(..., progress=progress)``.
     """
     times = TimeElapsedColumn(), TimeRemainingColumn()
-    columns = SpinnerColumn(), TextColumn("{task.description}"), _Steps(bar_width=30), *times
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), *times
     seen = err.is_terminal or err.is_jupyter
     with Bar(*columns, console=err, transient=True, get_time=clock, disable=not seen) as bar:
         line, current, last = bar.add_task("starting", total=None), "", 0
@@ -91,13 +90,6 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
             current, last = task, done
 
         yield update
-
-
-class _Steps(BarColumn):
-    """A bar for tasks of several steps."""
-
-    def render(self, task: Task) -> Any:
-        return Text("") if task.total is None else super().render(task)
 
 
 @contextmanager

@@ -9,8 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
-import typer
-
 from diffeo_calib.common.errors import InputError
 
 DESCRIPTION = Path(__file__).with_name("options.md")
@@ -22,7 +20,7 @@ TYPES: dict[str, tuple[Any, Any]] = {
     "seed": (int, int),
     "flag": (bool, bool),
     "files": (list[Path], Path),
-    **dict.fromkeys(("file", "table", "output", "folder"), (Path, Path)),
+    **dict.fromkeys(("file", "table", "output", "source", "folder"), (Path, Path)),
 }
 """Word for a type -> the type of a value, and what makes one of a text."""
 SHORT = {"output": "-o", "count": "-n"}
@@ -55,7 +53,7 @@ class Option(NamedTuple):
         head, _, text = entry.partition(": ")
         mark, name, spec, *more = head.split(" ")
         kind, equal, default = spec.rstrip("!").partition("=")
-        hint, made = TYPES.get(kind) or (Literal.__getitem__(tuple(kind.split("|"))), str)
+        hint, made = TYPES.get(kind) or (Literal[tuple(kind.split("|"))], str)
         how: dict[str, Any] = dict(SEEDS) if kind == "seed" else {}
         if more and re.match(r"[\d.e-]+\.\.", more[0]):
             ends = more.pop(0).partition("..")
@@ -68,15 +66,25 @@ class Option(NamedTuple):
         return cls(name, hint, MISSING if spec.endswith("!") else value, names, (*names, *more)[0], kind, how)
 
 
+class Section(NamedTuple):
+    """One of options.md: its text, field -> its entry, and which options need or exclude which."""
+
+    text: str
+    entries: dict[str, str]
+    rules: list[tuple[list[str], bool, list[str]]]
+
+
 @cache
-def description() -> dict[str, tuple[str, dict[str, str]]]:
-    """Section of options.md -> its text, and field -> its entry."""
-    found = dict[str, tuple[str, dict[str, str]]]()
+def description() -> dict[str, Section]:
+    """The sections of options.md."""
+    found = dict[str, Section]()
     for section in DESCRIPTION.read_text(encoding="utf-8").split("\n# ")[1:]:
         name, _, body = section.partition("\n")
-        text, *lines = re.split("^(?=[-*+] )", body, flags=re.MULTILINE)
-        entries = [" ".join(line.split()) for line in lines]
-        found[name] = text.strip(), {entry.partition(":")[0].split(" ")[1]: entry for entry in entries}
+        text, *lines = re.split("^(?=[-*+!] )", body, flags=re.MULTILINE)
+        heads = [(" ".join(line.split())).partition(":") for line in lines]
+        rules = [(head[2:].split(), rest.split()) for head, _, rest in heads if head.startswith("!")]
+        entries = {head.split(" ")[1]: f"{head}{colon}{rest}" for head, colon, rest in heads if head[0] != "!"}
+        found[name] = Section(text.strip(), entries, [(own, rest[0] == "need", rest[1:]) for own, rest in rules])
     return found
 
 
@@ -98,11 +106,11 @@ class Options:
         section = cls.__name__.lower()
         if section in description():
             cls.groups[section], cls.parts, cls.__annotations__ = cls, {}, {}
-            for name, entry in description()[section][1].items():
+            for name, entry in description()[section].entries.items():
                 if entry.startswith("+"):
                     cls.parts[entry.split(" ")[2]] = cls.groups.get(name) or type(name, (Options,), {})
                 else:
-                    cls.parts[name] = Option.of(entry if ": " in entry else description()["shared"][1][name])
+                    cls.parts[name] = Option.of(entry if ": " in entry else description()["shared"].entries[name])
             for name, part in cls.parts.items():
                 cls.__annotations__[name] = "Any"
                 if isinstance(part, Option) and part.default is not MISSING:
@@ -122,19 +130,16 @@ class Options:
         return cls(**{name: given[name] if isinstance(part, Option) else part.made(given) for name, part in found})
 
     @classmethod
-    def check_together(
-        cls, given: Mapping[str, Any], needs: Mapping[str, str], beside: Mapping[str, str] | None = None
-    ) -> None:
-        """Refuse options without those, separated by spaces, of which each needs one, or beside others."""
+    def check_together(cls, given: Mapping[str, Any]) -> None:
+        """Refuse options without those of which they need one, or beside those that they exclude."""
         typed = {one.shown for one in cls.all() if given[one.field] not in (None, [], one.default)}
-        for option, others in needs.items():
-            if option in typed and not any(other in typed for other in others.split()):
-                what = f"{option} without {' or '.join(others.split())}"
-                raise InputError.of(what, fix="name this too, or leave the option out")
-        for option, others in (beside or {}).items():
-            for other in others.split():
-                if option in typed and other in typed:
-                    raise InputError.of(f"{option} beside {other}", fix="leave one of them out")
+        for options, need, others in description()[cls.__name__.lower()].rules:
+            for option in (one for one in options if one in typed):
+                if need and not typed & {*others}:
+                    what = f"{option} without {' or '.join(others)}"
+                    raise InputError.of(what, fix="name this too, or leave the option out")
+                if not need and typed & {*others}:
+                    raise InputError.of(f"{option} beside {min(typed & {*others})}", fix="leave one of them out")
 
 
 def has(hint: Any, part: Any) -> bool:
@@ -181,82 +186,8 @@ class Candidates(Options):
 
 
 class Command(Options):
-    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them.
-
-    Attributes:
-        needs: option -> those of which it needs one. beside: option -> those that it cannot stand beside.
-    """
-
-    needs: ClassVar[dict[str, str]] = {}
-    beside: ClassVar[dict[str, str]] = {}
-
-    def check(self) -> None:
-        """Refuse options that cannot be meant."""
-
-    @property
-    def more_files(self) -> dict[str, Path]:
-        """Files that are written beside those that options name."""
-        return {}
+    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
 
-class Evaluate(Command):
-    """A registration, or errors."""
-
-    needs = dict.fromkeys(("--free", "-o"), "--register")
-    beside = dict.fromkeys(("--fail-above", "--residuals"), "--register")
-
-
-class Export(Command):
-    """Files to write."""
-
-    needs = dict.fromkeys(("--tool", "--frame"), "--c --torch --onnx") | {
-        "--with-tables": "--urdf --mjcf --dh --ur-kinematics",
-        "--ur-hash": "--ur-kinematics",
-        "--tip": "--c --dh",
-    }
-
-    @property
-    def outputs(self) -> dict[str, Path]:
-        """Option -> file to write, of those that are wanted."""
-        files = {one.shown: getattr(self, one.field) for one in self.all() if one.kind in ("output", "folder")}
-        return {option: path for option, path in files.items() if path is not None}
-
-    @property
-    def more_files(self) -> dict[str, Path]:
-        """The header of C."""
-        return {} if self.c is None else {"--c (its header)": self.c.with_suffix(".h")}
-
-    def check(self) -> None:
-        """Refuse to write nothing."""
-        if not self.outputs:
-            files = ", ".join(one.shown for one in self.all() if one.kind in ("output", "folder"))
-            raise typer.BadParameter(f"name at least one file to write: {files}")
-        if self.with_tables and self.correction_tables is None:
-            raise InputError.of("--with-tables without --correction-tables", fix="name both, or none")
-
-
-class Plan(Command):
-    """For a robot, or for a model."""
-
-    needs = dict.fromkeys(("--payload-mass", "--free"), "MODEL")
-    beside = dict.fromkeys(("--robot", "--base", "--tip", "--load", "--dh-convention", "--marker"), "MODEL")
-    beside |= dict.fromkeys(("--draw", "--range", "--tracker", "--floor", "--column", "--collisions"), "--candidates")
-
-    def check(self) -> None:
-        """Refuse to plan for nothing."""
-        if self.model is None and self.robot is None:
-            raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
-
-
-class Report(Command):
-    """Options of a table need one."""
-
-    needs = dict.fromkeys(("--position", "--socket", "--reading", "--length", "--angle", "--against"), "--data")
-
-
-COMMANDS: dict[str, type[Command]] = {
-    name: Options.groups.get(name) or type(name, (Command,), {})  # pyright: ignore[reportAssignmentType]
-    for name, (text, _) in description().items()
-    if text
-}
+COMMANDS = {name: type(name, (Command,), {}) for name, section in description().items() if section.text}
 """By name, in the order of the help."""

@@ -23,7 +23,7 @@ from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.images import ImageColumns
@@ -40,9 +40,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 POSE_JOINTS = 6
-NEEDS = {"--lever": "--rotation", "--camera-on-tool": "--rotation --reading", "--places": "--by", "--by": "--places"}
-NEEDS |= {"--distance-std": "--socket", "--distance": "--distance-std"}
-"""Options of rows, and those of which they need one."""
 
 
 def table_format(units: Units) -> TableFormat:
@@ -62,7 +59,7 @@ def table_format(units: Units) -> TableFormat:
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """The same format with the columns that options name, but for readings; lever in the unit of length."""
-    Rows.check_together(vars(rows), NEEDS)
+    Rows.check_together(vars(rows))
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
@@ -225,13 +222,6 @@ class MeasuredTable:
             add_to_command_line(["--marker", named])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
-
-    def warn_of_other_frames(self, count: int) -> None:
-        """Warn of rows of the fit that are judged in a frame in which they were not measured."""
-        if count and self.table.session is None:
-            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
-            fix = "name the column of the set-ups (--session), or leave these rows out"
-            warn_user(sentence(f"{what}its frame", fix=fix))
 
 
 @dataclass(frozen=True)

@@ -95,8 +95,9 @@ class Live:
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
-        begun, now = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), None), self._begun()
-        if names := [] if begun is None else [name for name in begun | now if begun.get(name) != now.get(name)]:
+        now = self._begun()
+        begun = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), now)
+        if names := [name for name in begun | now if begun.get(name) != now.get(name)]:
             then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
             fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
             what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"

@@ -86,7 +86,8 @@ class ToolOnTip:
             parts = poses[:, :3, 3] * table.per_metre, turned, known[0][:, :1] * table.per_metre
             numbers[allowed] = torch.cat(parts, dim=1)
         *pose, deviation = numbers.mT.tolist()
-        added: dict[str, Column] = dict(zip(names, pose, strict=True)) | {"status": list(map(str, found.status))}
+        added = dict[str, Column](zip(names, pose, strict=True))
+        added["status"] = list(map(str, found.status))
         added[self.name("miss", table.length)] = (self.own(found.miss) * table.per_metre).tolist()
         angle = self.own(found.angle_miss)
         if angle is not None:

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
 
+import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.options import Export
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
@@ -61,7 +62,7 @@ class _Export:
         geometry: the rigid kinematics that are written; None for none.
     """
 
-    def __init__(self, model: CalibratedKinematics, given: Export) -> None:
+    def __init__(self, model: CalibratedKinematics, given: Command) -> None:
         self.model, self.given = model, given
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
@@ -131,9 +132,13 @@ class _Export:
         return {folder / name: text.encode() for name, text in files.items()}
 
 
-def run(given: Export) -> None:
+def run(given: Command) -> None:
     """Write the files, then say what each leaves of the model."""
-    wanted, model = given.outputs, load_laden(given.model, given.payload_mass)
+    files = {one.shown: getattr(given, one.field) for one in given.all() if one.kind in ("output", "source", "folder")}
+    wanted: dict[str, Path] = {option: path for option, path in files.items() if path is not None}
+    if not wanted:
+        raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
+    model = load_laden(given.model, given.payload_mass)
     own = tool_in_tip(model, given.tool, given.tool_from, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
     source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)
@@ -153,7 +158,7 @@ def run(given: Export) -> None:
 
 
 def _write_programs(
-    model: CalibratedKinematics, given: Export, tool: Tensor | None, source: CFiles | None
+    model: CalibratedKinematics, given: Command, tool: Tensor | None, source: CFiles | None
 ) -> Iterator[str]:
     """Write the programs that are no texts, of the tool (4, 4), m, in the tip's frame; a sentence about each program.
 
@@ -203,7 +208,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
-def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
+def _dh_lines(table: DHTable, given: Command) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)

@@ -60,11 +60,20 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
 def run(given: Command) -> None:
     """Plan, write the poses, and print what to expect of them."""
     cell, count, output = given.cell, given.count, given.output
+    if given.model is None and given.robot is None:
+        raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
     with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
         stated = given.units if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
-        source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
+        numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
+        markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
+        source, markers = (
+            model or load_robot(given.robot, given.links),
+            markers / table.per_metre if numbers else markers,
+        )
+        if model is not None:
+            source, markers = planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(joints_of(stated), robot)
 
@@ -96,14 +105,6 @@ def run(given: Command) -> None:
     if found.devices:
         say("its column `device`: what measures the pose")
         say(*(line for one in sensors for line in one.sentences()))
-
-
-def _robot(given: Command, table: TableFormat) -> tuple[Tree, Tensor]:
-    """The robot, and the markers (P, 3) on its tip, m."""
-    robot = load_robot(given.robot or Path(), given.links)
-    numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
-    places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
-    return robot, places / table.per_metre if numbers else places
 
 
 def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
