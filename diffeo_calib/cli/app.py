@@ -41,6 +41,8 @@ JOINED = ("rotation-std",)
 """Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
+IN_FILE_OF = {"compare": "recalibrate", "report": "evaluate", "record": "images", "demo": "fit"}
+"""Command -> that whose file holds its work."""
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
@@ -139,7 +141,8 @@ def _declare(name: str, options: type[Command]) -> None:
                         written[f"{one.shown} (its header)"] = path.with_suffix(".h")
         check_outputs(written, read | appended, may_come=appended)
         options.check_together(given)
-        import_module(f"diffeo_calib.cli.commands.{name}").run(options.made(given))
+        module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
+        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options.made(given))
 
     for one in own:
         typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)

@@ -1,8 +1,9 @@
-"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model."""
+"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model; `demo`: an arm to calibrate."""
 
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -14,6 +15,7 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
+from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.options import Command
@@ -26,15 +28,19 @@ from diffeo_calib.cli.printed import (
     socket_lines,
     stage_line,
 )
-from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
+from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
+from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.errors import ERRORS
 from diffeo_calib.sensors.tables import divided
 
@@ -213,3 +219,26 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
             f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
             f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
         )
+
+
+POSITION = ("measurement_x", "measurement_y", "measurement_z")
+
+
+def run_demo(given: Command) -> None:
+    """Write an arm and its measurements, and calibrate it by a command that is printed."""
+    make_folder(folder := given.output)
+    arm = SimulatedArm(seed=given.seed)
+    urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
+    arm.write_urdf(urdf)
+    data = Measurements(*arm.measure(given.rows, seed=given.seed), arm.nominal.joint_names)
+    write_measurements(csv, data, TableFormat("mm", "deg"), position=POSITION)
+    lines = [
+        ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
+        ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
+        ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
+        ["--report", folder / "report.html"],
+    ]
+    command = [list(map(str, line)) for line in lines]
+    say(f"{given.rows} simulated measurements written to {csv}. Now running:\n")
+    say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
+    app([word for line in command for word in line])

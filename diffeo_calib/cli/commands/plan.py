@@ -68,10 +68,8 @@ def run(given: Command) -> None:
         table = table_format(stated)
         numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
         markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
-        source, markers = (
-            model or load_robot(given.robot, given.links),
-            markers / table.per_metre if numbers else markers,
-        )
+        markers = markers / table.per_metre if numbers else markers
+        source = model or load_robot(given.robot, given.links)
         if model is not None:
             source, markers = planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source

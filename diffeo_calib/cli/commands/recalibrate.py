@@ -1,23 +1,25 @@
-"""`diffeo-calib recalibrate`: an old model and a few new rows become one model. And how changes are told."""
+"""`diffeo-calib recalibrate`: an old model and a few new rows become one model; `compare`: what has changed since."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from diffeo_calib.calibration.recalibration.changes import Changes
+from diffeo_calib.calibration.recalibration.compare import compare
 from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.options import Command
-from diffeo_calib.cli.printed import frame_lines, placement_lines
+from diffeo_calib.cli.printed import frame_lines, motion_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.common.errors import few
+from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
@@ -90,3 +92,36 @@ def change_lines(changes: Changes, none: object = None) -> list[str]:
     listed = ", ".join(map(str, changes.smallest))
     smallest = [f"smallest change of an offset that these rows would show in nine cases of ten: {listed}"]
     return [f"  {change}" for change in changes.found] or [str(none or changes), *smallest[: len(changes.smallest)]]
+
+
+def run_compare(given: Command) -> None:
+    """Compare a model with new measurements, or with another model."""
+    model, other = load_kinematics(given.old), given.other
+    if _is_model(other):
+        if given.rows.named or given.units.length or given.units.angle:
+            fix = "leave out the options of tables, or name a table"
+            raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
+        rows: Any = load_kinematics(other)
+        say(*provenance_lines(model), *provenance_lines(rows))
+    else:
+        source = table_of(model, other, given.rows, given.units)
+        say(*provenance_lines(model), *another_date_lines(model))
+        rows = source.read(model.robot)
+    found = compare(model, rows, marker=given.tests.marker_freedom, seed=given.tests.seed)
+    kinds = {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
+    moved = {} if found.moved is None else {"transform": found.moved.transform}
+    record.add(**change_entries(found.changes, found.hidden), **moved, **entries_by_kind(kinds))
+    record.add(rows_can_tell=found.telling and found.changes.tested)
+    if found.moved is not None:
+        say(*motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them")))
+    say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
+    say(f"expected of it: {found.expectations.rms_text}", *change_lines(found.changes, found))
+
+
+def _is_model(path: Path) -> bool:
+    """Whether a file is a model rather than a table: its header is JSON after eight bytes."""
+    try:
+        with path.open("rb") as file:
+            return path.is_file() and file.read(9)[8:] == b"{"
+    except OSError:
+        return path.suffix.lower() not in (".csv", ".txt")
