@@ -7,8 +7,6 @@
 
 `diffeo-calib fit campaign.toml` runs as if the options had been typed. Options that are typed as well win,
 also those that may be repeated, such as `--tip`. Paths are relative to the folder of the file.
-
-Help is plain text: rich takes longer to load than everything else here.
 """
 
 from __future__ import annotations
@@ -19,12 +17,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli.console import INTERRUPTED, log_lines, show
 from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, description, has
 from diffeo_calib.cli.record import EXIT_INTERRUPTED, check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import InputError, as_written, printable
@@ -86,8 +86,6 @@ class FlagsOff(TyperGroup):
                 try:
                     return super().invoke(ctx)
                 except KeyboardInterrupt:  # there is no result to keep
-                    from diffeo_calib.cli.console import INTERRUPTED, show  # noqa: PLC0415
-
                     show("error", f"{INTERRUPTED}.")
                     raise typer.Exit(EXIT_INTERRUPTED) from None
         except typer.BadParameter as error:
@@ -162,8 +160,6 @@ for _name, _options in COMMANDS.items():
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version  # noqa: PLC0415
-
         typer.echo(f"diffeo-calib {version('diffeo_calib')}")
         raise typer.Exit
 
@@ -178,8 +174,6 @@ def common(
 ) -> None:
     """Calibrate robot kinematics from rows of measurements, whatever measured them."""
     if verbose:
-        from diffeo_calib.cli.console import log_lines  # noqa: PLC0415
-
         context.with_resource(log_lines())
 
 
@@ -221,9 +215,8 @@ def _entries(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError.of(
-            f"{path} is no TOML", got=str(error), fix='write one option per line: length = "mm"'
-        ) from error
+        fix = 'write one option per line: length = "mm"'
+        raise InputError.of(f"{path} is no TOML", got=str(error), fix=fix) from error
 
 
 def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:

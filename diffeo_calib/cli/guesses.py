@@ -33,23 +33,14 @@ LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
 
-class Named(NamedTuple):
-    """A column besides the joints and what was measured: names by which it is known; what it holds."""
-
-    names: tuple[str, ...]
-    what: str
-
-
 DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
 NAMED = {
-    "session": Named(
-        ("session", "setup", "station", "anchor", "device", "plane"), "the device, or its set-up, of every row"
-    ),
-    "payload": Named(("payload", "mass", "load"), "the known mass that the robot carried"),
-    "time": Named(("time", "times", "timeh", "timestamp", "seconds", "minutes", "hours", "hour"), DRIFT),
-    "temperature": Named(("temperature", "temp", "temperaturec", "tempc"), DRIFT),
+    "session": ("session setup station anchor device plane", "the device, or its set-up, of every row"),
+    "payload": ("payload mass load", "the known mass that the robot carried"),
+    "time": ("time times timeh timestamp seconds minutes hours hour", DRIFT),
+    "temperature": ("temperature temp temperaturec tempc", DRIFT),
 }
-"""By the option that names the column."""
+"""Option -> names by which a column besides the joints and what was measured is known, and what it holds."""
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
 ROTATIONS = (
@@ -142,11 +133,6 @@ class JointColumns(NamedTuple):
     names: list[str]
     how: str
     rank: tuple[int, ...]
-
-    @property
-    def shown(self) -> str:
-        """The first and the last."""
-        return f"{self.names[0]} to {self.names[-1]}" + " (commanded)" * bool(self.rank and self.rank[0])
 
 
 def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointColumns]:
@@ -359,9 +345,8 @@ class RowColumns:
             yield Choice("position", names, f"{len(names)} marker(s), by their names")
         yield from (Choice("", "", f"{text}; not used") for text in self.left)
         if self.sockets:
-            yield Choice(
-                "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
-            )
+            why = "by their names; a ball on the tool rested in this socket of a block there"
+            yield Choice("socket", self.sockets, why)
         if self.readings:
             why = "by names; `displacement` is a distance with an unknown zero"
             if any(text.endswith(LENS) for text in self.readings):
@@ -374,7 +359,7 @@ class RowColumns:
             texts = [CORNERS + relpath(file, folder) if file else text for file, text in pairs]
             yield Choice("reading", texts[0] if len(texts) == 1 else texts, why)
         for option, name in self.named.items():
-            why = f"by its name: {NAMED[option].what}"
+            why = f"by its name: {NAMED[option][1]}"
             remounted = option == "session" and bool(self.markers)
             why += "; add `remounted = true` if it stayed and the markers were mounted anew" * remounted
             yield Choice(option, name, why)
@@ -403,8 +388,8 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     named = [name for name in sheet.header if name not in joints]
     columns = {"session": [] if sockets and not readings else named}
     guessed = {
-        option: [name for name in columns.get(option, others) if column(name).plain in one.names]
-        for option, one in NAMED.items()
+        option: [name for name in columns.get(option, others) if column(name).plain in known.split()]
+        for option, (known, _) in NAMED.items()
     }
     found = {option: names[0] for option, names in guessed.items() if names}
     return RowColumns(markers, sockets, readings, found, [name for own in matrix[1:] for name in own], left)

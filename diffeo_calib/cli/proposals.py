@@ -125,6 +125,10 @@ class Source:
             except DiffeoCalibError:
                 return inf
 
+    def residuals(self, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
+        """In every format; the smallest first."""
+        return sorted(((self.residual(table), table) for table in formats), key=lambda found: found[0])
+
     def read_residual(self, table: TableFormat) -> float:
         """The same; DiffeoCalibError says why a table cannot be read so, or calibrates nothing."""
         data = self.read(table)
@@ -242,7 +246,7 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
     best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
     for length in UNITS_PER_METRE if len(equal) > 1 else ():
         tables = [replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")]
-        tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
+        tried = [(replace(source, joints=one.names).residuals(tables)[0][0], one) for one in equal]
         (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
         clear.append((second / least if 0 < least < LARGEST_RESIDUAL else 1.0, own))
     ratio, taken = max(clear, key=lambda entry: entry[0])
@@ -251,7 +255,8 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
         lines = [Choice("joints", ",".join(one.names), f"{why}: {one.how}", sure=False) for one in equal]
         return replace(source, joints=best.names), lines
     why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
-    why += "".join(f"; not {one.shown}" for one in found[:4] if one is not taken)
+    for one in (one for one in found[:4] if one is not taken):
+        why += f"; not {one.names[0]} to {one.names[-1]}" + " (commanded)" * bool(one.rank and one.rank[0])
     return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
 
 
@@ -277,11 +282,6 @@ def other_units(source: Source, table: TableFormat) -> list[str]:
     places = [name for triple in source.rows.markers for name in triple]
     pairs = *product(turning, (table.angle,)), *product(places, (table.length,))
     return [name for name, unit in pairs if column(name).unit not in ("", unit)]
-
-
-def residuals(source: Source, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
-    """Median residual of the nominal robot in every format; the smallest first."""
-    return sorted(((source.residual(table), table) for table in formats), key=lambda found: found[0])
 
 
 def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
@@ -316,9 +316,7 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     units = product(UNITS_PER_METRE, ("rad", "deg")) if camera else [(table.length, table.angle)]
     known = replace(table, rotation=each[0] if len(each) == 1 else each, camera_on_tool=camera)
     ways = [(*unit, *turn) for unit, turn in product(units, turns)]
-    clear = residuals(
-        source, [replace(known, length=a, angle=b, convention=c, rotation_angle=d) for a, b, c, d in ways]
-    )
+    clear = source.residuals(replace(known, length=a, angle=b, convention=c, rotation_angle=d) for a, b, c, d in ways)
     if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"

@@ -357,7 +357,7 @@ def _left(
         for length, angle, slide, camera in ways
         if slide != length
     )
-    return proposals.residuals(source, formats)
+    return source.residuals(formats)
 
 
 def _used(choices: list[Choice]) -> set[str]:
