@@ -8,8 +8,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.main import command_line
 from diffeo_calib.cli.options import Links, Robot, Rows, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user

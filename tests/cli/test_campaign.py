@@ -15,14 +15,14 @@ from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
 
 import diffeo_calib as dc
-from diffeo_calib.cli.app import DECLARED as KNOWN
-from diffeo_calib.cli.app import app, expanded
 from diffeo_calib.cli.guesses import (
     guess_deviations,
     guess_positions,
     guess_rotation,
     guess_sheet,
 )
+from diffeo_calib.cli.main import DECLARED as KNOWN
+from diffeo_calib.cli.main import app, expanded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat

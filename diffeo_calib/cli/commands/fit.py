@@ -15,8 +15,8 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
-from diffeo_calib.cli.app import app
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
+from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
