@@ -238,25 +238,19 @@ def _alike(
 
     Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
     shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
-    geometry", 1991).
+    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
 
     Args:
         commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. seen: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
-    found = list[tuple[float, tuple[Reading, Reading, bool]]]()
-    place, own = commanded[0][some], torch.stack([*commanded[1].values()])[:, some]
-    size = max(float((own - own.mean(0)).norm(dim=1).mean()) for own in (place, seen[0][some])) or 1.0
-    screws = _screws(place, own, size)
-    for camera in (False, True):
-        places, turns = seen[0][some], torch.stack([*seen[1].values()])[:, some]
-        shifts = -(turns.mT @ places[:, :, None])[..., 0] if camera else places
-        others = _screws(shifts, turns.mT if camera else turns, size)
-        left = (screws[:, None] - others).square().mean(2).sqrt()  # (a, b)
-        each = product(commanded[1], seen[1])
-        found += [(float(one), (*pair, camera)) for one, pair in zip(left.flatten(), each, strict=True)]
-    found.sort(key=lambda entry: entry[0])
-    return [way for left, way in found if left <= ALIKE * found[0][0]][:MOST_WAYS]
+    bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, seen)]
+    size = max(float((place - place.mean(0)).norm(dim=1).mean()) for place, _ in bodies) or 1.0
+    own, others = (_screws(*body, size) for body in bodies)
+    left = (own[:, None] - others).square().mean(2).sqrt().flatten().tolist()
+    found = sorted(zip(left, product(commanded[1], seen[1]), strict=True), key=lambda entry: entry[0])
+    alike = [pair for one, pair in found if one <= ALIKE * found[0][0]][: MOST_WAYS // 2]
+    return [(*pair, camera) for pair in alike for camera in (False, True)]
 
 
 def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:

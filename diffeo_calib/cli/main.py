@@ -27,7 +27,7 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING
 from importlib import import_module
@@ -88,7 +88,7 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        _arguments[:] = expanded(args, DECLARED)
+        _arguments[:] = expanded(args)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -194,21 +194,17 @@ def common(
 # --- campaign files ---------------------------------------------------------------------------------------------------
 
 
-def expanded(arguments: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The same command line with a campaign file written out, for `campaign` without what only `fit` knows.
-
-    Args:
-        known: command -> name of an option, without dashes, or of an argument -> type of its value.
-    """
+def expanded(arguments: Sequence[str]) -> list[str]:
+    """The same command line with a campaign file written out, for `campaign` without what only `fit` knows."""
     words = list(arguments)
     at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
     if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):
         return words
     path = Path(words[at + 1])
-    options = known[words[at]]
-    entries = {name: value for name, value in _entries(path).items() if name in options or name not in known[COMMAND]}
-    unknown = [name for name in entries if name not in options]
-    if unknown:
+    options = DECLARED[words[at]]
+    of_fit = {*DECLARED[COMMAND]} - {*options}
+    entries = {name: value for name, value in _entries(path).items() if name not in of_fit}
+    if unknown := [name for name in entries if name not in options]:
         expected = f"options of `{words[at]}`: {', '.join(options)}"
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")
     if "csv" not in entries:

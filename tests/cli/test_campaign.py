@@ -21,7 +21,6 @@ from diffeo_calib.cli.guesses import (
     guess_rotation,
     guess_sheet,
 )
-from diffeo_calib.cli.main import DECLARED as KNOWN
 from diffeo_calib.cli.main import app, expanded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -41,7 +40,7 @@ def campaign(tmp_path: Path, text: str) -> str:
 
 def test_entries_become_options(tmp_path: Path) -> None:
     text = 'csv = "a.csv"\nrobot = "r.urdf"\nposition = ["x,y,z", "u,v,w"]\njoints = ["q1", "q2"]\nholdout = 0.2\n'
-    words = expanded(["fit", campaign(tmp_path, text), "--holdout", "0"], KNOWN)
+    words = expanded(["fit", campaign(tmp_path, text), "--holdout", "0"])
     table = [str(tmp_path / "a.csv"), "--robot", str(tmp_path / "r.urdf")]
     markers = ["--position", "x,y,z", "--position", "u,v,w", "--joints", "q1,q2"]
     assert words == ["fit", *table, *markers, "--holdout", "0"]
@@ -51,13 +50,13 @@ def test_entries_become_options(tmp_path: Path) -> None:
 def test_typed_options_replace_those_of_the_file(tmp_path: Path, typed: list[str]) -> None:
     """A tip beside those of the file would be another arm."""
     text = 'csv = "a.csv"\ntip = ["one", "two"]\nholdout = 0.2\n'
-    words = expanded(["fit", campaign(tmp_path, text), *typed], KNOWN)
+    words = expanded(["fit", campaign(tmp_path, text), *typed])
     assert words[2:] == ["--holdout", "0.2", *typed]
 
 
 @pytest.mark.parametrize("words", [["fit", "a.csv"], ["evaluate", "a.toml"], ["fit"], []])
 def test_other_command_lines_stay(words: list[str]) -> None:
-    assert expanded(words, KNOWN) == words
+    assert expanded(words) == words
 
 
 @pytest.mark.parametrize(
@@ -72,9 +71,9 @@ def test_other_command_lines_stay(words: list[str]) -> None:
 )
 def test_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        expanded(["fit", campaign(tmp_path, text)], KNOWN)
+        expanded(["fit", campaign(tmp_path, text)])
     with pytest.raises(InputError, match=r"none\.toml"):
-        expanded(["fit", str(tmp_path / "none.toml")], KNOWN)
+        expanded(["fit", str(tmp_path / "none.toml")])
 
 
 @pytest.mark.parametrize(
@@ -92,7 +91,7 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
     assert (done.code, done.err) == (0, "")
     assert "the nominal robot leaves, of what the rows vary" in done.out
-    words = expanded(["fit", str(out / "cell.toml")], KNOWN)
+    words = expanded(["fit", str(out / "cell.toml")])
     options = dict(zip(words[2::2], words[3::2], strict=True))
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
     assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)
@@ -127,7 +126,7 @@ def test_sockets_are_proposed(tmp_path: Path, init: Any) -> None:
     assert "# all columns are used" in text
     filled = tomllib.loads(text.replace("# distance", "distance"))
     assert filled["distance"] == ["a,b=50"]
-    words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], KNOWN)
+    words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))])
     assert words[words.index("--socket") + 1] == "place,socket"
     assert words[words.index("--distance") + 1] == "a,b=50"
 
