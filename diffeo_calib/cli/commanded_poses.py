@@ -257,12 +257,12 @@ def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
     """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
 
     Args:
-        places: (N, 3) or (c, N, 3), m. R: (c, N, 3, 3), of c readings.
+        places: (N, 3), m. R: (c, N, 3, 3), of c readings.
     """
-    places, found = places.expand(len(R), -1, -1), list[Tensor]()
+    found = list[Tensor]()
     for step in STEPS:
         turns = R.mT @ R.roll(-step, 1)
-        shifts = (R.mT @ (places.roll(-step, 1) - places)[..., None])[..., 0]
+        shifts = (R.mT @ (places.roll(-step, 0) - places)[..., None])[..., 0]
         skew = turns - turns.mT
         axes = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], 2)
         trace = turns.diagonal(dim1=2, dim2=3).sum(2)
