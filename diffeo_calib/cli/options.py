@@ -53,6 +53,7 @@ class Option(NamedTuple):
         head, _, text = entry.partition(": ")
         mark, name, spec, *more = head.split(" ")
         kind, equal, default = spec.rstrip("!").partition("=")
+        hint: Any
         hint, made = TYPES.get(kind) or (Literal[tuple(kind.split("|"))], str)
         how: dict[str, Any] = dict(SEEDS) if kind == "seed" else {}
         if more and re.match(r"[\d.e-]+\.\.", more[0]):

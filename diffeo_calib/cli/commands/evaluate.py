@@ -84,7 +84,7 @@ def run(options: Command) -> None:
     say(*(line for errors in found.values() for line in socket_lines(errors, "all rows")))
     say(*expectation_lines(model, data))
     warn_outside_range(model, data.q)
-    if (count := rows_of_other_frames(model, data.q)) and source.table.session is None:
+    if (count := rows_of_other_frames(model, data.q)) and not source.table.session:
         what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
         fix = "name the column of the set-ups (--session), or leave these rows out"
         warn_user(sentence(f"{what}its frame", fix=fix))
