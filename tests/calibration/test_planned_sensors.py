@@ -22,7 +22,8 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.planning.board_images import BoardImages
 from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
-from diffeo_calib.cameras.images import Images, expected, sees, shown, sighted
+from diffeo_calib.cameras.images import Images, sees, shown, sighted
+from diffeo_calib.cameras.images import expected as expected_errors
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import LEVER, poses_from_marks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
@@ -326,7 +327,7 @@ def test_an_image_tells_what_its_pose_shows() -> None:
     corners = arm.shown(0.1)[1]
     whole = (~corners[..., 3].isnan()).all(1)
     found = sighted(Images(corners[whole, :, :3], corners[whole, :, 3:], WIDTH, HEIGHT), None, BOARD_PRIOR)
-    covariance, effects = expected(found.camera, found.poses)
+    covariance, effects = expected_errors(found.camera, found.poses)
     ratio = covariance.diagonal(dim1=1, dim2=2) / found.covariance.diagonal(dim1=1, dim2=2)
     assert 0.6 < float(ratio.median()) < 1.6  # an image's noise is its own
     assert_close(effects @ found.camera.root, found.shared, rtol=0, atol=0.02 * float(found.shared.abs().max()))
