@@ -129,9 +129,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    named = PROGRAM in command and not units.robot_pose
-    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if named else ""
-    if PROGRAM in program:
+    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
+    if PROGRAM in program and units.robot_pose in (None, program.partition("=")[0]):  # of other names: places
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
     if words:

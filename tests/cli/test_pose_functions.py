@@ -42,6 +42,8 @@ def test_a_function_in_place_of_a_robot(
     assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=my_delta.py:kinematics" in done.error
     done = command("predict", model, "delta.csv", *pose, "-o", tmp_path / "p.csv")
     assert done.code == 0, done.error
+    done = command("predict", model, "delta.csv", "--robot-pose", "q1,q2,q3", "-o", tmp_path / "q.csv")
+    assert "type it again, a model file starts no program" in done.error  # joint values are no places
     (header, *rows), (_, *measured) = cells(tmp_path / "p.csv"), cells(delta / "delta.csv")
     assert header[:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     found = torch.tensor([[float(cell) for cell in row[:6]] for row in rows], dtype=torch.float64)
