@@ -95,6 +95,38 @@ def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, command: Command) 
 
 
 @pytest.mark.slow
+def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
+    table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    done = command(
+        "fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json", "--report", tmp_path / "r"
+    )
+    assert done.code == 0, done.error
+    assert "camera in the frame of" in (tmp_path / "r").read_text(encoding="utf-8")
+    for name, link, truth in (("camera", "in_tip", CAMERA), ("board", "in_base", BOARD)):
+        found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["results"]["hand_eye"][f"{name}_{link}"]
+        away = torch.tensor(found["pose_m"], dtype=torch.float64)[:3, 3] - truth[:3, 3]
+        assert bool((away.abs() < 4 * torch.tensor(found["position_std_m"])).all())
+        assert float(away.norm()) < 1e-3
+    model = tmp_path / "t.safetensors"
+    done = command("export", model, "--camera", tmp_path / "camera")
+    assert done.code == 0, done.error
+    text = (tmp_path / "camera" / "easy_handeye2.calib").read_text(encoding="utf-8")
+    assert 'calibration_type: "eye_in_hand"' in text
+    x = float(text.partition("x: ")[2].partition("\n")[0])
+    assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
+    # the same poses again: predicted and planned under the names of the table, and corrected by little
+    assert command("predict", model, table, "-o", tmp_path / "p.csv").code == 0
+    assert command("plan", model, "-n", "3", "-o", tmp_path / "n.csv").code == 0
+    done = command("correct", model, table, "-o", tmp_path / "d.csv")
+    assert done.code == 0, done.error
+    (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
+    for one, other in zip(before, after, strict=True):
+        assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
+    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+
+
+@pytest.mark.slow
 def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any) -> None:
     commanded = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     measured = bent(commanded) + 2e-5 * drawn(80, 3, seed=2)
