@@ -133,7 +133,8 @@ class HandEye:
         made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
         on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words
-        if model.lever is None or model.registration is not None or not (seen or on_tool or "--robot-pose" in words):
+        seen_board = bool(model.lever) and (bool(seen) or on_tool or "--robot-pose" in words)
+        if not seen_board or model.registration:
             return {}
         return cls.of_each(model, camera_on_tool=on_tool)
 
