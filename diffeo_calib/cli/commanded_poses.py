@@ -32,6 +32,8 @@ NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
 SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
+UNUSUAL_LENGTHS = ("", ""), ("cm", ""), ("inch", ""), ("", "cm"), ("", "inch")
+"""Units of the machine's places and of those measured, tried until one explains the rows; empty: by their size."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 JOINTS = "q0", "q1"
@@ -134,7 +136,12 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
         left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
         rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
-    found = sorted(_read(csv, sheet, machine, rows, body), key=lambda entry: entry[0])
+    found = list[tuple[float, Source]]()
+    for lengths in UNUSUAL_LENGTHS:
+        found += _read(csv, sheet, machine, rows, body, lengths=lengths)
+        found.sort(key=lambda entry: entry[0])
+        if found and found[0][0] <= proposals.LARGEST_RESIDUAL:
+            break
     if found and found[0][0] == inf:
         found[0][1].read_residual(found[0][1].table)  # says why
     if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
@@ -171,17 +178,20 @@ def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterato
 
 
 def _read(
-    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None
+    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None, *, lengths: tuple[str, str]
 ) -> Iterator[tuple[float, Source]]:
-    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
+    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained.
+
+    ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
+    """
     turn, place = ([], []) if body is None else (body.turn, body.place)
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(csv, sheet, [name for names in groups for name in names])
     if not len(numbers):
         return
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
-    length = _lengths(machine.place, commanded_at)[0]
-    other = _lengths(place, seen_at)[0] if place else length
+    length = lengths[0] or _lengths(machine.place, commanded_at)[0]
+    other = lengths[1] or (_lengths(place, seen_at)[0] if place else length)
     own, seen = _readings(commanded_turn), _readings(seen_turn)
     if own and seen:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
