@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -139,7 +140,8 @@ def outliers(
         left_out: their leave-one-out errors.
     """
     noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
-    bad = excluded_by_others(squares, noise.of_freedom(float, squares))
+    least = gates.UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
+    bad = excluded_by_others(squares, noise.of_freedom(float, squares), least)
     each = left_out.errors.unflatten(1, (noise.bodies, -1))
     distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
     found = []

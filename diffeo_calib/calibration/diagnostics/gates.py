@@ -64,6 +64,8 @@ model have hardly any weight, since outliers look like a change."""
 
 OUTLIER_CHANCE = 0.01
 """Of any outlier among clean rows."""
+UNCHOSEN_FACTOR = 9.0
+"""Least size of squared errors where the rows are too few to choose scales: defaults may be overconfident."""
 MEDIAN_EFFICIENCY = 0.5
 """Of the median of squared errors, in place of their mean, as an estimate of their variance: .37, .53 and .58 of one,
 three and six numbers."""
