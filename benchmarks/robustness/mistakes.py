@@ -5,10 +5,9 @@
 
 `true_mm` is the RMS error at 300 random configurations after the best rigid motion, `expected_mm` what the model
 expects of itself over the joint ranges of its rows, `said` the refusal or the first words of the warnings and how many
-rows look wrong, `silent`
-whether the true error is above three times the expected one and nothing was said. Clean campaigns differ in robot,
-rows, markers and noise: plain, with outliers, with heavy tails, and in blocks along motions; there every warning counts
-as a false alarm.
+rows look wrong, `silent` whether the true error is above three times the expected one and nothing was said. Clean
+campaigns differ in robot, rows, markers and noise: plain, with outliers, with heavy tails, and in blocks along motions;
+there every warning counts as a false alarm.
 """
 
 from __future__ import annotations
