@@ -55,6 +55,11 @@ def f_below(probability: float, upper: float, lower: float) -> float:
     return float(_special().fdtri(upper, lower, probability))
 
 
+def above_estimated(probability: float, freedom: float, lower: float) -> float:
+    """As :func:`chi2_above`, of squares in units of a variance that ``lower`` degrees of freedom estimate."""
+    return freedom * f_below(1.0 - probability, freedom, lower)
+
+
 def binomial_band(count: int, share: float, chance: float) -> tuple[int, int]:
     """The successes of ``count`` trials of probability ``share``: fewer, or more, have at most this chance each."""
     at_most = _special().bdtr(np.arange(count + 1), count, share)

@@ -120,7 +120,7 @@ def test_rows_that_carried_another_payload_than_said(wrong: int) -> None:
     labels[2 : 3 * wrong : 3] = 0.0
     texts = said(measured(masses).with_payload(labels))
     assert len(texts) == bool(wrong)
-    assert all("fit a payload of 10: lines 2, 5" in text for text in texts)
+    assert all("fit a payload of 10: lines 2," in text for text in texts)
 
 
 # --- names that few rows carry ----------------------------------------------------------------------------------------

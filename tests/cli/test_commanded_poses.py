@@ -60,14 +60,12 @@ def test_init_finds_what_the_numbers_mean(
     assert found.get("camera-on-tool", False) is camera_on_tool
 
 
-def test_init_finds_poses_in_inches(tmp_path: Path, command: Command) -> None:
+def test_init_finds_poses_in_inches(tmp_path: Path, init: Any) -> None:
     table = hand_eye_table(tmp_path / "t.csv", "xyz", "deg", camera_on_tool=True)
     header, *rows = cells(table)
     lines = [header, *([*(str(float(cell) / 25.4) for cell in row[:3]), *row[3:]] for row in rows)]
     table.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
-    done = command("init", table, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.error
-    found = tomllib.loads((tmp_path / "c.toml").read_text(encoding="utf-8"))
+    found, _ = init(table)
     assert (found["joint-length"], found["length"], found["robot-pose"]) == ("inch", "mm", "X,Y,Z,RX,RY,RZ=xyz")
 
 
