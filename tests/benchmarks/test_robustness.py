@@ -80,9 +80,3 @@ def test_a_wrong_axis_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(dc, "load_urdf", careless)
     assert any("SILENTLY WRONG" in one for one in defects("urdfs.py", urdfs.case, range(20)))
-
-
-def test_a_wrong_unit_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python's own `csv` and `float` are the second opinion on tables."""
-    monkeypatch.setitem(tables.FACTORS, "mm", 1.0)
-    assert any("SILENTLY WRONG" in one for one in defects("tables.py", tables.case, range(1, 20)))

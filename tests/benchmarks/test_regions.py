@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
-
+import coverage
 import numpy as np
 import pytest
 import region_limits
 import regions
+import torch
 from coverage import INSIDE_95
 from reading_bank import scales
-from varied_arms import KINDS, OUTLIER_M, Kind, VariedArm
+from varied_arms import OUTLIER_M, Kind, VariedArm
 
 import diffeo_calib as dc
 
@@ -22,29 +22,6 @@ def test_an_arm_is_measured_with_its_noise() -> None:
     assert float(errors.std()) == pytest.approx(3e-5, rel=0.05)
     wrong = VariedArm(own.nominal, Kind(outliers=0.02), 4)
     assert float((wrong.measured(q, 0) - wrong.true_points(q)).abs().max()) > OUTLIER_M
-
-
-@pytest.mark.parametrize("kind", ["usual", "repeated", "motions", "small"])
-def test_rows_of_a_kind(kind: str) -> None:
-    own = VariedArm(regions.chains(None)[0], KINDS[kind], 0)
-    q = own.rows(30, 0)
-    apart = (q[1:] - q[:-1]).norm(dim=1)
-    assert q.shape == (30, 6)
-    assert int((apart == 0).sum()) == (20 if kind == "repeated" else 0)
-    low, high = own.nominal.limits.unbind(1)
-    assert bool(((q >= low) & (q <= high)).all())
-    reach = float(((q - 0.5 * (low + high)).abs() / (0.5 * (high - low))).max())
-    assert reach < (0.31 if kind == "small" else 1.01)
-    assert float(apart.median()) < 1.0 if kind == "motions" else float(apart.max()) > 1.0
-
-
-def test_another_date_moves_the_device_and_drifts() -> None:
-    own = regions.arm("usual", 0, None)
-    q = own.rows(20, 0)
-    same, drifted = (own.later(7000, drift).true_points(q)[:, 0] for drift in (0.0, 0.2))
-    here = own.true_points(q)[:, 0]
-    assert float((same - here).norm(dim=1).min()) > 0.1
-    assert 1e-5 < float((drifted - same).norm(dim=1).mean()) < 5e-3
 
 
 def test_summary_counts_sets_within_the_targets() -> None:
@@ -62,11 +39,6 @@ def test_summary_counts_sets_within_the_targets() -> None:
     assert all(row["sharp"] == pytest.approx(2 / 3) and row["robot"] == "" for row in found)
 
 
-def test_a_failure_is_a_record() -> None:
-    keys: regions.Record = {"method": "fresh", "case": "unknown"}
-    assert "unknown" in str(regions.measured(keys, "unknown", 20, 0, Namespace(data=None))["note"])
-
-
 @pytest.mark.slow
 def test_one_record() -> None:
     (record,) = regions.measure(regions.arguments(["--quick"]))
@@ -81,3 +53,29 @@ def test_right_regions_hold_nineteen_of_twenty_in_the_mean() -> None:
     inside = (region_limits.squares(model, own.test.q[:60], 300, 0) < INSIDE_95).double().mean(0)
     assert float(inside.mean()) == pytest.approx(0.95, abs=0.01)
     assert 0.03 < float(inside.std()) < 0.2  # more than chance in 60 rows gives: errors have a cause in common
+
+
+# --- the benchmark of coverage: its draws, its distances, and one whole record ----------
+
+
+def test_noise_is_gaussian_or_has_heavy_tails() -> None:
+    shape, rng = (20_000, 1, 3), np.random.default_rng(0)
+    clean, heavy = (coverage.noise(shape, case, 2e-5, rng) for case in ("clean", "t3"))
+    assert float(clean.std()) == pytest.approx(2e-5, rel=0.02)
+    assert float(heavy.abs().median()) == pytest.approx(0.765 * 2e-5, rel=0.03)  # of Student's t
+    assert float(heavy.abs().max()) > 10 * float(clean.abs().max())
+
+
+def test_squared_distances_are_chi_squared() -> None:
+    root = torch.tensor([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0], [0.5, -1.0, 3.0]], dtype=torch.float64)
+    errors = torch.from_numpy(np.random.default_rng(0).standard_normal((20_000, 3))) @ root.T
+    inside = coverage.squares(errors, (root @ root.T).expand(20_000, 3, 3)) < coverage.INSIDE_95
+    assert float(inside.double().mean()) == pytest.approx(0.95, abs=0.005)
+
+
+@pytest.mark.slow
+def test_one_record_of_coverage() -> None:
+    record = coverage.simulated("outliers", 20, 0)
+    for name in ("measured", "true", "outside"):
+        assert 0.5 < float(record[name] or 0) <= 1.0, name
+    assert 0.005 < float(record["perfect_std"] or 0) < 0.08
