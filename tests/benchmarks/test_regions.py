@@ -1,4 +1,4 @@
-"""The benchmark of regions: its arms, its records and its summary."""
+"""The benchmarks of regions and of coverage: arms, records and summaries."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_right_regions_hold_nineteen_of_twenty_in_the_mean() -> None:
     assert 0.03 < float(inside.std()) < 0.2  # more than chance in 60 rows gives: errors have a cause in common
 
 
-# --- the benchmark of coverage: its draws, its distances, and one whole record ----------
+# --- coverage ---------------------------------------------------------------------------------------------------------
 
 
 def test_noise_is_gaussian_or_has_heavy_tails() -> None:
