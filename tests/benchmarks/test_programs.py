@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
-import busy_machine
 import compensation
 import generated_c
 import numpy as np
@@ -15,7 +13,6 @@ import ours
 import peers
 import pytest
 import queries
-import sentences
 import torch
 from c_bank import needs_compiler
 from covariates import Split
@@ -39,27 +36,6 @@ def test_queries_of_a_saved_model(arm: Case, tmp_path: Path) -> None:
     for record in records:
         assert set(queries.COLUMNS) == set(record)
         assert record["difference"] < 1e-6
-
-
-# --- the benchmark beside a busy process: it measures every call, and stops the process that it starts ----------
-
-
-def test_calls_run_without_and_with_a_busy_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[bytes]] = []
-    real = subprocess.Popen
-
-    def popen(*words: object, **options: object) -> subprocess.Popen[bytes]:
-        started.append(real(*words, **options))  # pyright: ignore[reportCallIssue, reportArgumentType]
-        return started[-1]
-
-    monkeypatch.setattr(busy_machine.subprocess, "Popen", popen)
-    monkeypatch.setattr(busy_machine, "SETTLING_S", 0.0)
-    beside: list[bool] = []
-    record = busy_machine.compare(lambda: beside.append(any(one.poll() is None for one in started)), 2)
-    assert set(beside) == {False, True}
-    assert len(started) == 2
-    assert all(one.poll() is not None for one in started)
-    assert record["ratio"] == pytest.approx(record["busy_ms"] / record["idle_ms"])  # pyright: ignore[reportOperatorIssue]
 
 
 # --- generated C ------------------------------------------------------------------------------------------------------
@@ -122,14 +98,6 @@ def test_tiles_of_plain_matrices_change_nothing(data: Landmarks, task: str, monk
     monkeypatch.setitem(BACKENDS, "tiled", ours.PlainTiles())
     for one, other in zip(ours.Tiled(data).function(task, 1)(), pooled, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13)
-
-
-def test_time_steps_have_their_order(data: Landmarks) -> None:
-    small = Landmarks(*(part[:40] for part in data))
-    end = ours.Dense(small).endpoint(6)
-    coarse, fine = (float((ours.TiledRK4(small).endpoint(steps) - end).abs().max()) for steps in (4, 8))
-    assert 10 < coarse / fine < 25  # 2^4
-    assert float((peers.DenseAutograd(small).endpoint(8) - end).abs().max()) == pytest.approx(fine, rel=1e-3)
 
 
 # --- compensation -----------------------------------------------------------------------------------------------------
@@ -195,15 +163,3 @@ def test_a_drift_is_found_and_a_shuffled_time_is_not() -> None:
         away = (model.target[model.new] - mean).view(-1, 3)
         rms, _ = model.predicted(further, known=known)
         assert rms == pytest.approx(1e6 * float(away.square().sum(1).mean().sqrt()), rel=1e-6)
-
-
-# --- the list of what is refused and warned about names sentences that users see ----------
-
-
-def test_sentences_are_put_together_as_users_see_them(capsys: pytest.CaptureFixture[str]) -> None:
-    sentences.main()
-    text = capsys.readouterr().out
-    assert "| refused | file '{path}' does not exist; check the name and the folder" in text
-    assert "| warned | {count} are too few to select scales: defaults are used; measure at least" in text
-    assert all(f"## {title}" in text for title in sentences.TITLES.values())
-    assert len(set(sentences.sentences())) > 200

@@ -15,7 +15,7 @@ import pytest
 import real_robots
 import torch
 from harness import Record
-from robot_data import BUILT_IN, DESCRIPTOR, RobotData, check, find, read
+from robot_data import DESCRIPTOR, RobotData, find, read
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
@@ -118,22 +118,6 @@ def test_every_method_on_a_small_arm() -> None:
     assert set(real_robots.COLUMNS) - set(records["geometry"]) == set()
 
 
-def test_a_failure_is_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> baselines.Fitted:
-        raise ValueError("not today")
-
-    def missing(*_: object) -> baselines.Fitted:
-        raise ModuleNotFoundError("No module named 'sklearn'", name="sklearn")
-
-    robot, train, test = arm_data(20)
-    split = protocols.Split("curve", "20", 0, train, test)
-    for method, word in ((broken, "not today"), (missing, "pip install")):
-        monkeypatch.setitem(baselines.METHODS, "geometry", method)
-        record = real_robots.attempt(RobotData("arm", robot, train), split, "geometry")
-        assert word in str(record["note"])
-        assert "rms_mm" not in record
-
-
 def test_errors_of_orientations_are_recorded() -> None:
     arm = SimulatedArm(seed=1)
     q = arm.sample(20)
@@ -202,11 +186,6 @@ def test_bad_descriptors(folder: Path) -> None:
         descriptor.write_text(text)
         with pytest.raises(InputError, match=r"dataset\.json"):
             find(folder)
-
-
-def test_built_in_descriptors_follow_the_format() -> None:
-    for name, entries in BUILT_IN.items():
-        check(Path(name), json.loads(json.dumps(entries)))
 
 
 # --- splits -----------------------------------------------------------------------------------------------------------

@@ -24,21 +24,6 @@ def test_an_arm_is_measured_with_its_noise() -> None:
     assert float((wrong.measured(q, 0) - wrong.true_points(q)).abs().max()) > OUTLIER_M
 
 
-def test_summary_counts_sets_within_the_targets() -> None:
-    keys = {"seed": 0, "drift": None, "robot": None, "rms_mm": 0.1, "seconds": 1.0}
-    values = ((0.91, 1.0), (0.95, 1.2), (0.985, 1.1))
-    records = [
-        keys | {"method": method, "case": "usual", "rows": rows, "new": new, "sharpness": sharp}
-        for method, rows in (("fresh", 20), ("fresh", 60), ("registered", 20))
-        for new, sharp in values
-    ]
-    failed = {"method": "fresh", "case": "usual", "rows": 20, "seed": 1, "note": "it failed"}
-    found = regions.summary([*records, failed])
-    assert [row["sets"] for row in found] == [3, 3, 3]
-    np.testing.assert_allclose([float(row["within"] or 0) for row in found], [1.0, 1 / 3, 2 / 3])
-    assert all(row["sharp"] == pytest.approx(2 / 3) and row["robot"] == "" for row in found)
-
-
 @pytest.mark.slow
 def test_one_record() -> None:
     (record,) = regions.measure(regions.arguments(["--quick"]))

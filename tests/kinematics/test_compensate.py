@@ -109,15 +109,6 @@ def test_positions_with_the_direction_of_an_axis(arm: Case) -> None:
         assert float(turned[found.reached].max()) > 1e-5  # the turn about the axis is free
 
 
-def test_weights_move_the_work_to_other_joints(arm: Case) -> None:
-    q = commands(arm, 30, seed=3)
-    targets = intended(arm, q)[:, :3, 3]
-    even = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    heavy = dc.compensate(arm.model, targets, q, tool=tool_frame(), weights=[1e4, 1, 1, 1, 1, 1])
-    assert bool((even.reached & heavy.reached).all())
-    assert float(heavy.correction[:, 0].abs().max()) < 0.05 * float(even.correction[:, 0].abs().max())
-
-
 def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
     q = slider.test.q[:100]
     targets = intended(slider, q)
@@ -223,15 +214,6 @@ def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
         beyond = float(q[row, joint] - narrow[joint, 1]) > BOUND
         assert bool(found.q[row].isnan().any()) == beyond
     assert found.counts["limit"] > 5
-
-
-def test_a_start_just_beyond_a_limit_is_brought_back(arm: Case) -> None:
-    q = commands(arm, 20, seed=9)
-    targets = intended(arm, q)
-    narrow = torch.stack([q.amin(0) - 1, q.amax(0) - 0.5 * BOUND], 1)
-    found = dc.compensate(arm.model, targets[:, :3, 3], q, tool=tool_frame(), limits=narrow)
-    assert bool((found.q <= narrow[:, 1]).all())
-    assert bool((found.correction.abs() <= BOUND).all())
 
 
 def test_one_bad_row_disturbs_no_other(arm: Case) -> None:

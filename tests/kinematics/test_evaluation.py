@@ -192,19 +192,6 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
         dc.evaluate(arm.model, far)
 
 
-def test_implausible_orientations_have_a_sentence(posed: Case) -> None:
-    """Positions fit, but the rotations were read in a wrong convention."""
-    assert implausible(posed.model, posed.test, dc.evaluate(posed.model, posed.test)) is None
-    poses = posed.test.poses
-    assert poses is not None
-    turned = dc.Measurements.from_poses(
-        posed.test.q, transforms(poses[:, :3, :3].mT, poses[:, :3, 3]), lever=posed.test.lever or 0.0
-    )
-    text = implausible(posed.model, turned, dc.evaluate(posed.model, turned)) or ""
-    assert "degrees by the model's own" in text
-    assert "`convention` and `rotation_angle`" in text
-
-
 @pytest.mark.parametrize("function", [dc.rows_used_in_fit, dc.joints_outside_range])
 def test_ranges_belong_to_a_model(function: object) -> None:
     with pytest.raises(InputError, match="`model`: expected a calibrated model of a robot, got int"):

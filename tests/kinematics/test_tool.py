@@ -47,21 +47,6 @@ def test_a_tool_that_was_never_measured(pair: Case) -> None:
     assert float(angle_between(found[:, :3, :3], truth[:, :3, :3]).square().mean().sqrt().rad2deg()) < 0.05
 
 
-def test_one_marker_leaves_the_roll_of_the_last_joint_to_the_prior(arm_200: Case) -> None:
-    """Known well along the last axis, not beside it; the predicted deviations say so."""
-    axis, along, beside = arm_200.robot.axes[-1], torch.eye(4, dtype=torch.float64), tool_frame()
-    along[:3, 3] = simulated(200)[0].truth.tool[0] + 0.1 * axis
-    truth = true_poses(200, 1, arm_200.test.q, along)
-    along[:3, 3] = arm_200.model.geometry.tool[0] + 0.1 * axis  # the same place beside the marker
-    found = arm_200.model.tool_poses(arm_200.test.q, along, "measuring")
-    assert float((found - truth)[:, :3, 3].norm(dim=1).square().mean().sqrt()) < 2.0 * arm_200.held_out()[-1]
-    covariance = arm_200.model.predict_tool_poses(arm_200.test.q[:50], beside, "measuring")[1]
-    deviation = float(covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
-    error = position_error(arm_200, 200, 1, beside)
-    assert error > 3.0 * arm_200.held_out()[-1]  # beside the axis
-    assert error < 3.0 * deviation
-
-
 def test_points_of_the_markers_are_those_of_the_model(pair: Case) -> None:
     """The origin of a tool at a marker is that marker, moved by the same flows."""
     for k, marker in enumerate(pair.model.geometry.tool):
@@ -156,11 +141,6 @@ TOOL = tool_transform([0.15, -0.12, 0.16])
 STEP = 1e-5
 
 
-def rms(covariance: Tensor) -> float:
-    """Of a shift, m."""
-    return float(covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(1).mean().sqrt())
-
-
 def reference(case: Case) -> Tensor:
     known = case.model.configurations
     count = min(len(known), REFERENCE_ROWS)
@@ -199,30 +179,6 @@ def test_motions_of_base_and_tool_count_for_nothing(arm: Case, monkeypatch: pyte
     monkeypatch.setattr(FittedMap, "covariance_between", wider)
     after = covariance_without_placement(arm.model, q, TOOL)
     assert_close(after, before, rtol=0, atol=1e-3 * float(before.diagonal(dim1=1, dim2=2).max()))
-
-
-def test_it_is_what_the_truth_leaves_after_both_are_taught(arm_200: Case) -> None:
-    """One marker: most of the tool's error is its place on the flange, and a robot's base is known even worse."""
-    simulated_arm, _, _ = simulated(200)
-    simulated_arm.truth = replace(simulated_arm.truth, tool=mark_points(TOOL[None], TOOL_LEVER)[0])
-    q = torch.cat([reference(arm_200), arm_200.test.q])
-    truth = poses_from_marks(simulated_arm.true_points(q), TOOL_LEVER)
-    found = arm_200.model.tool_poses(q, TOOL, "measuring")
-    errors = points(found) - points(truth)
-    twists = torch.eye(6, dtype=torch.float64)
-    motions = [(moved(arm_200, q, twist, of=of) - points(found)) / STEP for of in ("base", "tool") for twist in twists]
-    S, count = torch.stack(motions, 1), 9 * len(reference(arm_200))
-    taught = torch.linalg.lstsq(S[:count], errors[:count, None]).solution
-    rest = (errors[:, None] - S @ taught)[count:].view(-1, 3, 3).mean(1)  # the middle of the three points
-    left = float(rest.square().sum(1).mean().sqrt())
-    whole = float(errors[count:].view(-1, 3, 3).mean(1).square().sum(1).mean().sqrt())
-    predicted = rms(covariance_without_placement(arm_200.model, arm_200.test.q, TOOL))
-    in_base, measuring = (
-        rms(arm_200.model.predict_tool_poses(arm_200.test.q, TOOL, frame)[1]) for frame in ("base", "measuring")
-    )
-    assert left < 0.5 * whole
-    assert 0.5 * left < predicted < 2.0 * left
-    assert predicted < 0.5 * measuring < 0.5 * in_base
 
 
 def test_rows_alone_and_together_are_the_same(arm: Case) -> None:

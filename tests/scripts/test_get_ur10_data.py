@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import get_ur10_data
@@ -16,7 +14,6 @@ from robot_data import find, read
 
 import diffeo_calib as dc
 
-SCRIPT = Path(get_ur10_data.__file__)
 JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)
 ROWS = [f"{0.1 * k:.1f};0,2;0,3;0,4;0,5;{0.2 * k:.1f};10{k},5;2;3;10;20;30".replace(".", ",") for k in range(4)]
 POSITION = "measurement_x;measurement_y;measurement_z;measurement_rx;measurement_ry;measurement_rz"
@@ -72,12 +69,6 @@ def test_the_urdf_is_the_dh_table(small: Path, tmp_path: Path) -> None:
     torch.testing.assert_close(robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
 
 
-def test_downloads(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(get_ur10_data, "URL", small.as_uri())
-    get_ur10_data.main([str(tmp_path)])
-    assert (tmp_path / "ipa_ur10" / get_ur10_data.FILE).read_bytes() == TABLE
-
-
 def test_failures_leave_nothing(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,20 +90,6 @@ def test_failures_leave_nothing(
     assert list(folder.iterdir()) == []
 
 
-def test_a_disk_that_fills_up(
-    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(path: Path, data: bytes) -> int:
-        if path.name == "LICENSE.md":
-            raise OSError(28, "No space left on device")
-        with path.open("wb") as file:
-            return file.write(data)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    assert "No space left" in failure(capsys, tmp_path / "new" / "data", "--from", small)
-    assert not (tmp_path / "new").exists()
-
-
 def test_existing_files_are_never_changed(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     get_ur10_data.main([str(tmp_path), "--from", str(small)])
     before = (tmp_path / "ipa_ur10" / "dataset.json").stat().st_mtime_ns
@@ -122,15 +99,6 @@ def test_existing_files_are_never_changed(small: Path, tmp_path: Path, capsys: p
     (tmp_path / "ipa_ur10" / "dataset.json").write_text("{}")
     assert "exists with other contents" in failure(capsys, tmp_path, "--from", small)
     assert (tmp_path / "ipa_ur10" / "dataset.json").read_text() == "{}"
-
-
-def test_as_a_program_without_the_package(tmp_path: Path) -> None:
-    """Standard library only, and exit code 1."""
-    command = [sys.executable, "-I", "-S", str(SCRIPT), str(tmp_path / "data"), "--from", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
 
 
 def test_the_published_file(ur10_folder: Path, tmp_path: Path) -> None:
