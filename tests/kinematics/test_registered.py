@@ -113,13 +113,6 @@ def test_rows_of_the_model_itself_change_nothing(arm: Case) -> None:
     assert before > 0.1
 
 
-def test_regions_of_a_changed_robot_are_widened_once(arm: Case) -> None:
-    """Variances by a factor of 50: a base that was found is no open one by that."""
-    fitted, q = arm.model.map, arm.test.q[:5]
-    widened = fitted.inflated(50.0).predict(q, noise=False)[1]
-    torch.testing.assert_close(widened, 50 * fitted.predict(q, noise=False)[1], rtol=1e-6, atol=0.0)
-
-
 @pytest.mark.parametrize("free", ["both", "base"])
 def test_a_moved_tracker(arm: Case, free: str) -> None:
     T = transform(5)
@@ -197,15 +190,6 @@ def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
         kept = arm.model.registered(bent)
     assert any("times as large as the model" in str(one.message) for one in told)
     assert len(kept.configurations) == len(arm.model.configurations)
-
-
-def test_a_model_that_is_dense_stays_dense(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans need the covariances of a dense model: rows that would end it are not learnt."""
-    size = 3 * arm.model.markers * len(arm.model.configurations)
-    rows = seen(arm, slice(0, 20), transform(22))
-    for largest, more in ((size + 60 * arm.model.markers, 20), (size, 0)):
-        monkeypatch.setattr("diffeo_calib.kinematics.re_registration.both_dates.MAX_DENSE", largest)
-        assert len(arm.model.registered(rows).configurations) == len(arm.model.configurations) + more
 
 
 @pytest.mark.parametrize("wrong", [{3: (0.0, 0.02, 0.0)}, {3: (0.0, 0.01, 0.0), 7: (-0.3, -0.3, -0.3)}])
