@@ -17,13 +17,12 @@ import torch
 from c_bank import needs_compiler
 from covariates import Split
 from deformation_bank import model_of
-from landmarks import TASKS, Landmarks, Method, exact, landmarks
+from landmarks import Landmarks, Method, exact, landmarks
 from product_bank import Case
 from robots_bank import CHAINS, draw
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.kernels.reductions.backends import BACKENDS
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 
@@ -90,14 +89,6 @@ def test_results_are_exact(data: Landmarks, method: type[Method], task: str) -> 
         pytest.skip("not offered")
     for found, expected in zip(method(data).function(task, 1)(), exact(task, data, ROWS), strict=True):
         assert float((found[ROWS] - expected).norm() / expected.norm()) < 1e-11
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_tiles_of_plain_matrices_change_nothing(data: Landmarks, task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pooled = ours.Tiled(data).function(task, 1)()
-    monkeypatch.setitem(BACKENDS, "tiled", ours.PlainTiles())
-    for one, other in zip(ours.Tiled(data).function(task, 1)(), pooled, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13)
 
 
 # --- compensation -----------------------------------------------------------------------------------------------------
