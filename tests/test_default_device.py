@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from kind_bank import kind_named
-from product_bank import Case, simulated
+from product_bank import Case
 from robots_bank import crooked, draw
-from section_5 import section_5
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib
 import diffeo_calib as dc
-from diffeo_calib.robots import SimulatedArm, elastic_rr, from_dh, load_urdf, se3
+from diffeo_calib.robots import SimulatedArm, from_dh, load_urdf, se3
 from diffeo_calib.robots.gravity import GravitySag
 
 URDF = Path(se3.__file__).with_name("simulated_arm.urdf")
@@ -90,45 +88,7 @@ def test_robots() -> None:
     same(robots)
 
 
-# --- fits and models --------------------------------------------------------------------------------------------------
-
-TWICE, LBFGS = dc.GaussNewton(max_iterations=2), dc.LBFGS(max_iterations=3)
-FITS: dict[str, Callable[[dc.Problem], dc.Fit]] = {
-    "chosen steps": dc.fit,
-    "adaptive": lambda problem: dc.fit(problem, TWICE, dc.TorchDiffEq("dopri5", rtol=1e-2, atol=1e-3)),
-    "L-BFGS": lambda problem: dc.fit(problem, LBFGS, dc.RK4(2), backend="dense"),
-    "descent": lambda problem: dc.fit(problem, dc.GradientDescent(1e-6, max_iterations=3), dc.RK4(1), backend="tiled"),
-    "conjugate gradients": lambda problem: dc.fit(problem, dc.GaussNewton(linear="cg"), dc.RK4(2)),
-    "controls": lambda problem: dc.fit(problem, TWICE, dc.RK8(1), controls=20),
-    "eulerian": lambda problem: dc.fit(problem, LBFGS, dc.RK4(1), formulation="eulerian"),
-}
-
-
-@pytest.mark.parametrize("name", FITS)
-def test_fits(name: str) -> None:
-    def work() -> list[Any]:
-        found, x = FITS[name](section_5(k=6)), elastic_rr.grid(3)
-        predicted = () if name == "eulerian" else found.model.predict(x)
-        return [found.model(x), found.model.jacobian(x), found.energy, *predicted]
-
-    same(work)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-@pytest.mark.parametrize("name", ["scales searched", "several kinds", "two cameras"])
-def test_calibrations(name: str) -> None:
-    arm, few, _ = simulated(16, markers=2)
-    kind = None if name == "scales searched" else kind_named(name)
-    given: Any = (arm.nominal, few, None) if kind is None else (kind.robot, kind.data, kind.scales)
-
-    def work() -> list[Any]:
-        result = dc.calibrate(*given[:2], hyperparameters=given[2])
-        q, report = given[1].q[:5], list(result.model.report.items())
-        rest = *result.placement.sentences(), result.status, result.left_out.rms_text
-        return [result.model(q), *result.model.predict(q), report, *rest]
-
-    same(work)
+# --- models --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

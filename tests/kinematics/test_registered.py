@@ -140,20 +140,6 @@ def test_another_marker(arm: Case) -> None:
     assert float((found(found.inverse(start, q[:3] + 0.01)) - start).abs().max()) < 1e-8
 
 
-def test_two_markers_after_one(arm: Case) -> None:
-    """The number of markers changes, and back."""
-    T, q = transform(7), arm.test.q
-    two = torch.cat([NEW_MARKER, NEW_MARKER + torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64)])
-    found = arm.model.registered(other_marker(two, q[:8], T))
-    assert found(q[:5]).shape == (5, 2, 3)
-    assert found.jacobian(q[:5]).shape == (5, 2, 3, 6)
-    assert found.predict(q[:5])[1].shape == (5, 2, 3, 3)
-    assert rms(found, other_marker(two, q[8:], T, seed=6)) < 3.0 * rms(arm.model, arm.test)
-    back = found.registered(seen(arm, slice(0, 12), T))
-    assert back.markers == 1
-    assert rms(back, seen(arm, slice(12, None), T)) < 2.5 * rms(arm.model, arm.test)
-
-
 def test_poses_after_a_marker_and_a_marker_after_poses(arm: Case, posed: Case) -> None:
     T = transform(8)
     tool = transform(20)
@@ -242,14 +228,6 @@ def test_a_marker_that_may_have_moved_is_weighed(arm: Case) -> None:
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         kept = arm.model.registered(data, free="base")
     assert record(kept).excess > 2 * found.excess
-
-
-def test_only_the_marker(arm: Case) -> None:
-    eye = torch.eye(4, dtype=torch.float64)
-    found = arm.model.registered(other_marker(NEW_MARKER, arm.test.q[:4], eye), free="marker")
-    assert torch.equal(record(found).transform, eye)
-    assert rms(found, other_marker(NEW_MARKER, arm.test.q[4:], eye, seed=6)) < 3.0 * rms(arm.model, arm.test)
-    assert torch.equal(record(found).frame_deviations, torch.zeros(6, dtype=torch.float64))
 
 
 def test_known_deviations_count(arm: Case) -> None:

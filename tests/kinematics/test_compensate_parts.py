@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
+from product_bank import Case
 from recorded_bank import made_with
+from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
 from torch.testing import assert_close
@@ -13,7 +19,9 @@ from two_arms_bank import HANDS, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.compensation.box_search import box_minimum, joint_limits
 from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.robots.joint import Joint
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -120,3 +128,90 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     for change, message in wrong:
         with pytest.raises(InputError, match=message):
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
+
+
+# --- parts of the search: quadratic programs against every face of the box, limits of mimic joints, models ----------
+
+Array = np.ndarray
+
+
+def smallest(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """By trying every face of the box."""
+    best, value = np.zeros_like(g), np.inf
+    for face in product((0, 1, 2), repeat=len(g)):
+        kind = np.array(face)
+        s = np.where(kind == 0, 0.0, np.where(kind == 1, low, high))
+        free = kind == 0
+        s[free] = np.linalg.solve(H[np.ix_(free, free)], -(g + H @ s)[free])
+        if (s >= low - 1e-12).all() and (s <= high + 1e-12).all() and 0.5 * s @ H @ s + g @ s < value:
+            best, value = s, 0.5 * s @ H @ s + g @ s
+    return best
+
+
+def test_the_minimum_in_a_box() -> None:
+    """Well and badly conditioned, on faces of every dimension, with joints that cannot move."""
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((200, 4, 4)) * 10.0 ** rng.uniform(-3, 0, (200, 1, 4))
+    H = root @ root.swapaxes(1, 2) + 1e-8 * np.eye(4)
+    g, low, high = rng.standard_normal((200, 4)), -rng.random((200, 4)), rng.random((200, 4))
+    low[::3, 1], high[::5, 2] = 0.0, 0.0
+    low[::7, 3] = high[::7, 3] = 0.0
+    found = box_minimum(H, g, low, high)
+    for row in range(200):
+        expected = smallest(H[row], g[row], low[row], high[row])
+        values = [0.5 * s @ H[row] @ s + g[row] @ s for s in (found[row], expected)]
+        assert values[0] == pytest.approx(values[1], rel=1e-9, abs=1e-12)
+        assert bool(((found[row] >= low[row]) & (found[row] <= high[row])).all())
+
+
+# --- limits -------------------------------------------------------------------------------------------------------
+
+
+def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:
+    """Three joints, the last of which follows others within its own limits."""
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[0, 3] = 0.3
+    joints = [Joint(f"j{k}", "revolute", frame, lower=-2.0, upper=2.0) for k in range(2)]
+    joints.append(Joint("j2", "revolute", frame, lower=low, upper=high, mimic=mimic, mimic_offset=offset))
+    return dc.Chain("limited", "floor", "hand", joints)
+
+
+def test_limits_of_a_mimic_joint_bind_its_driver() -> None:
+    found = joint_limits(limited({"j1": -2.0}, 0.5, -1.5, 1.0), None)
+    np.testing.assert_allclose(found.low, [-2.0, -0.25])
+    np.testing.assert_allclose(found.high, [2.0, 1.0])
+    assert not len(found.matrix)
+    assert np.isinf(joint_limits(parallelogram(), None).high).all()
+
+
+def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
+    found = joint_limits(limited({"j0": 1.0, "j1": 1.0}, 0.0, -1.0, 1.0), None)
+    start = np.array([[0.5, 0.4], [0.1, 0.1], [0.8, 0.8], [0.5, 0.5]])
+    q = start + np.array([[0.1, 0.1], [0.1, 0.1], [0.0, 0.0], [-0.1, 0.0]])
+    kept = found.within(start, q)
+    np.testing.assert_allclose(kept[0], [0.55, 0.45])
+    np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
+    assert np.isnan(kept[2]).all()
+
+
+# --- models -------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
+    model = arm.model.with_tool([0.0, 0.0, 0.1])
+    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
+    seen = weakref.ref(model)
+    del model
+    gc.collect()
+    assert seen() is None
+
+
+def test_torch_and_numpy_find_the_same_commands(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models without constants for NumPy are evaluated by torch."""
+    q = arm.test.q[:10]
+    targets = arm.robot(q)
+    found = dc.compensate(arm.model.with_tool(None), targets, q)
+    monkeypatch.setattr("diffeo_calib.kinematics.tool.program_of", lambda _: None)
+    again = dc.compensate(arm.model.with_tool(None), targets, q)
+    assert found.status == again.status
+    torch.testing.assert_close(again.q[found.reached], found.q[found.reached], rtol=0, atol=1e-7)
