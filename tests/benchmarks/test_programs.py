@@ -37,7 +37,7 @@ def test_queries_of_a_saved_model(arm: Case, tmp_path: Path) -> None:
         assert record["difference"] < 1e-6
 
 
-# --- generated C ------------------------------------------------------------------------------------------------------
+# --- generated C ----------------------------------------------------------------------------------------------------
 
 
 @needs_compiler
@@ -67,7 +67,7 @@ def test_pinocchio_computes_the_nominal_robot(name: str) -> None:
     assert slopes[0].shape == (6, robot.n)
 
 
-# --- kernel sums ------------------------------------------------------------------------------------------------------
+# --- kernel sums ----------------------------------------------------------------------------------------------------
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
@@ -91,7 +91,7 @@ def test_results_are_exact(data: Landmarks, method: type[Method], task: str) -> 
         assert float((found[ROWS] - expected).norm() / expected.norm()) < 1e-11
 
 
-# --- compensation -----------------------------------------------------------------------------------------------------
+# --- compensation ---------------------------------------------------------------------------------------------------
 
 
 def test_true_errors_of_perfect_commands_are_zero() -> None:
@@ -120,7 +120,7 @@ def test_the_true_tool_is_as_good_as_the_held_out_frame() -> None:
     assert int(str(ours["rows"])) > 500
 
 
-# --- covariates -------------------------------------------------------------------------------------------------------
+# --- covariates -----------------------------------------------------------------------------------------------------
 
 
 def drifting() -> tuple[Split, Tensor, Tensor]:

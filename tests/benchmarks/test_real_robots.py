@@ -56,7 +56,7 @@ def arm_data(rows: int, **options: int) -> tuple[dc.Chain, dc.Measurements, dc.M
     return arm.nominal, dc.Measurements(q[:rows], points[:rows]), dc.Measurements(q[rows:], points[rows:])
 
 
-# --- fixtures ---------------------------------------------------------------------------------------------------------
+# --- fixtures -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "NETWORK_STEPS", 50)
 
 
-# --- methods, records, the program ------------------------------------------------------------------------------------
+# --- methods, records, the program ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         harness.earlier([out], real_robots.KEY)
 
 
-# --- data sets --------------------------------------------------------------------------------------------------------
+# --- data sets ------------------------------------------------------------------------------------------------------
 
 
 def test_data_sets_of_a_folder(folder: Path) -> None:
@@ -188,7 +188,7 @@ def test_bad_descriptors(folder: Path) -> None:
             find(folder)
 
 
-# --- splits -----------------------------------------------------------------------------------------------------------
+# --- splits ---------------------------------------------------------------------------------------------------------
 
 
 def repeated() -> dc.Measurements:
@@ -224,7 +224,7 @@ def test_curves_are_nested_and_drawn_from_the_same_split() -> None:
         assert torch.equal(split.test.q, test.q)
 
 
-# --- peers ------------------------------------------------------------------------------------------------------------
+# --- peers ----------------------------------------------------------------------------------------------------------
 
 
 def test_joint_offsets_are_recovered() -> None:
@@ -244,7 +244,7 @@ def test_joint_offsets_are_recovered() -> None:
     assert float((own - robot.axes).abs().max()) < 1e-12
 
 
-# --- means ------------------------------------------------------------------------------------------------------------
+# --- means ----------------------------------------------------------------------------------------------------------
 
 
 def test_means_over_seeds() -> None:

@@ -30,7 +30,7 @@ def test_right_regions_hold_nineteen_of_twenty_in_the_mean() -> None:
     assert 0.03 < float(inside.std()) < 0.2  # more than chance in 60 rows gives: errors have a cause in common
 
 
-# --- coverage ---------------------------------------------------------------------------------------------------------
+# --- coverage -------------------------------------------------------------------------------------------------------
 
 
 def test_squared_distances_are_chi_squared() -> None:

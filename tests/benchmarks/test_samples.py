@@ -32,7 +32,7 @@ def rms(predict: Predict, truth: Tensor, x: Tensor) -> float:
     return float((predict(x) - truth).square().sum(1).mean().sqrt())
 
 
-# --- the arm ------------------------------------------------------------------------------------------------------
+# --- the arm --------------------------------------------------------------------------------------------------------
 
 
 def test_extended_arm_is_the_nominal_one_with_exact_derivatives() -> None:
@@ -47,7 +47,7 @@ def test_extended_arm_is_the_nominal_one_with_exact_derivatives() -> None:
         torch.testing.assert_close(arm.jacobian(at, theta), torch.stack(by_x), rtol=0, atol=1e-13)  # pyright: ignore
 
 
-# --- known answers ------------------------------------------------------------------------------------------------
+# --- known answers --------------------------------------------------------------------------------------------------
 
 
 def test_geometry_is_exact_where_the_truth_is_geometric() -> None:
@@ -99,7 +99,7 @@ def test_tangent_and_flow_agree_where_deformations_are_small() -> None:
     assert rms(flow, elastic_rr.real(test, 1e-3), test) < 5e-6  # of 1e-4 that the nominal arm leaves
 
 
-# --- cases and records --------------------------------------------------------------------------------------------
+# --- cases and records ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -117,4 +117,4 @@ def test_program(tmp_path: Path) -> None:
     assert all(f"<!-- {name} -->" in figure.read_text() for name in FAST)
 
 
-# --- kernels and choices ------------------------------------------------------------------------------------------
+# --- kernels and choices --------------------------------------------------------------------------------------------

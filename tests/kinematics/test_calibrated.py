@@ -31,7 +31,7 @@ def case(name: str, request: pytest.FixtureRequest) -> Case:
     return request.getfixturevalue(name)
 
 
-# --- derivatives --------------------------------------------------------------------------------------------------
+# --- derivatives ----------------------------------------------------------------------------------------------------
 
 
 @CASES
@@ -43,7 +43,7 @@ def test_jacobian_against_autograd(case: Case) -> None:
     assert_close(case.model.jacobian(q.detach()), expected, rtol=1e-9, atol=1e-12)
 
 
-# --- prediction ---------------------------------------------------------------------------------------------------
+# --- prediction -----------------------------------------------------------------------------------------------------
 
 
 @CASES
@@ -106,7 +106,7 @@ def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, 
     assert 0.85 <= float(torch.cat(inside).double().mean()) <= 0.99
 
 
-# --- inverse ------------------------------------------------------------------------------------------------------
+# --- inverse --------------------------------------------------------------------------------------------------------
 
 
 @CASES
@@ -141,7 +141,7 @@ def test_unreachable_target(arm: Case) -> None:
         arm.model.inverse(targets, start)
 
 
-# --- input --------------------------------------------------------------------------------------------------------
+# --- input ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_rows(arm: Case) -> None:
@@ -204,7 +204,7 @@ def test_full_turns_change_nothing(arm: Case) -> None:
     assert_close(arm.model.predict(turned)[1], arm.model.predict(q)[1], rtol=1e-6, atol=1e-16)
 
 
-# --- the poses of calibrated kinematics: their fit to three points, covariances and inverse ----------
+# --- the poses of calibrated kinematics: their fit to three points, covariances and inverse -------------------------
 
 
 def test_poses_fit_the_points_of_the_model(posed: Case) -> None:

@@ -56,7 +56,7 @@ def inside(case: Case, found: dc.Compensation, bound: float = BOUND) -> bool:
     return bool(((found.q >= low) & (found.q <= high) & (found.correction.abs() <= bound)).all())
 
 
-# --- reached ------------------------------------------------------------------------------------------------------
+# --- reached --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frame", ["base", "measuring"])
@@ -122,7 +122,7 @@ def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
     assert float(short.correction[:, 2].abs().max()) <= 1e-5
 
 
-# --- not reached --------------------------------------------------------------------------------------------------
+# --- not reached ----------------------------------------------------------------------------------------------------
 
 
 def near_wrist_singularity(case: Case, rows: int) -> Tensor:
@@ -193,7 +193,7 @@ def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
     assert dc.compensate(arm.model, aside, regular, tool=tool_frame()).counts.get("singular", 0) == 0
 
 
-# --- limits -------------------------------------------------------------------------------------------------------
+# --- limits ---------------------------------------------------------------------------------------------------------
 
 
 def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
@@ -228,7 +228,7 @@ def test_one_bad_row_disturbs_no_other(arm: Case) -> None:
     assert [together.status[row] for row in others] == [alone.status[row] for row in others]
 
 
-# --- input --------------------------------------------------------------------------------------------------------
+# --- input ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_rows(arm: Case) -> None:
@@ -265,7 +265,7 @@ def test_wrong_input(arm: Case) -> None:
             dc.compensate(**given)  # pyright: ignore[reportArgumentType]
 
 
-# --- thousands of targets at once, a redundant arm, and a bound of work ----------
+# --- thousands of targets at once, a redundant arm, and a bound of work ---------------------------------------------
 
 
 @pytest.mark.slow
@@ -326,7 +326,7 @@ def test_a_redundant_arm_stays_near_its_start() -> None:
         assert float(share.quantile(0.95)) < 0.02
 
 
-# --- paths: corrections that change slowly, jumps that are named, commands that start at the row before ----------
+# --- paths: corrections that change slowly, jumps that are named, commands that start at the row before -------------
 
 
 def line(case: Case, rows: int, seed: int = 3) -> Tensor:

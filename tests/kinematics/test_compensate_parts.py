@@ -164,7 +164,7 @@ def test_the_minimum_in_a_box() -> None:
         assert bool(((found[row] >= low[row]) & (found[row] <= high[row])).all())
 
 
-# --- limits -------------------------------------------------------------------------------------------------------
+# --- limits ---------------------------------------------------------------------------------------------------------
 
 
 def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:
@@ -194,7 +194,7 @@ def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
     assert np.isnan(kept[2]).all()
 
 
-# --- models -------------------------------------------------------------------------------------------------------
+# --- models ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:

@@ -103,7 +103,7 @@ def test_measurements_of_a_data_frame_know_the_names(table: Table, arm: Case) ->
         dc.Measurements(shuffled(table, arm.robot, q), points)
 
 
-# --- results as data frames of pandas ----------
+# --- results as data frames of pandas -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["arm", "pair"])

@@ -55,7 +55,7 @@ def test_another_number_of_markers(arm: Case, pair: Case) -> None:
         dc.evaluate(pair.model, arm.test)
 
 
-# --- poses --------------------------------------------------------------------------------------------------------
+# --- poses ----------------------------------------------------------------------------------------------------------
 
 
 def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
@@ -114,7 +114,7 @@ def test_predictions_on_a_line_have_no_orientation(posed: Case) -> None:
         dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)
 
 
-# --- calibrated models --------------------------------------------------------------------------------------------
+# --- calibrated models ----------------------------------------------------------------------------------------------
 
 
 def test_rows_of_the_fit_are_recognised_up_to_rounding(arm: Case) -> None:
@@ -193,7 +193,7 @@ def test_ranges_belong_to_a_model(function: object) -> None:
         function(3, [[0.0]])  # pyright: ignore[reportCallIssue]
 
 
-# --- joint values in the other unit of angles are refused by every verb that compares rows with a model ----------
+# --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------
 
 
 def in_other_unit(rows: Any, factor: float) -> Any:

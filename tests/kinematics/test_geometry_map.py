@@ -93,7 +93,7 @@ def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     assert torch.equal(elastic.jacobian(x, longer), rigid.jacobian(x, theta))
 
 
-# --- parameters that differ from row to row -----------------------------------------------------------------------
+# --- parameters that differ from row to row -------------------------------------------------------------------------
 
 
 @every_chain
@@ -114,7 +114,7 @@ def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
 
 
-# --- waves of gears in the nominal map: derivatives, names, transmission errors ----------
+# --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
 
 
 @every_chain

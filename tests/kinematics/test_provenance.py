@@ -84,7 +84,7 @@ def test_entries_that_cannot_be_read() -> None:
         Provenance.from_dict(ENTRIES | {"note": 3})
 
 
-# --- the summary of a calibration: as a dictionary, from dictionaries of every age, and in model files ----------
+# --- the summary of a calibration: as a dictionary, from dictionaries of every age, and in model files --------------
 
 SUMMARY = Summary(
     registration_rms=8e-4,

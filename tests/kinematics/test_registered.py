@@ -351,7 +351,7 @@ def test_a_marker_that_the_fit_hardly_knew(ur10_folder: Path) -> None:
     assert dc.evaluate(found, other.rows(rows[20:])).rms < 6e-4  # held to its old place: 7 mm
 
 
-# --- linearised rows of a new set-up: the Gaussian that they are, with explicit matrices ----------
+# --- linearised rows of a new set-up: the Gaussian that they are, with explicit matrices ----------------------------
 
 M, R, K = 6, 3, 4
 DRAWS = torch.Generator().manual_seed(0)

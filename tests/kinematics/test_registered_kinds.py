@@ -126,7 +126,7 @@ def test_the_middle_of_a_socket_with_one_row_is_known_as_well_as_a_row() -> None
     assert float(deviations.max()) < 1e-4
 
 
-# --- markers of new rows in another order than in the fit ----------
+# --- markers of new rows in another order than in the fit -----------------------------------------------------------
 
 
 @cache

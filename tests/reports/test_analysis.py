@@ -268,7 +268,7 @@ def test_bands_of_transmission_errors_hold_the_truth(arm_200: Case) -> None:
     assert 0.85 < np.mean(inside) <= 1.0
 
 
-# --- the plot of errors by stage --------------------------------------------------------------------------------------
+# --- the plot of errors by stage ------------------------------------------------------------------------------------
 
 
 def errors(rows: int, scale: float, seed: int, markers: int = 1) -> Evaluation:
