@@ -21,7 +21,7 @@ from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
-ENTRIES: dict[str, str] = {
+ORIGIN: dict[str, str] = {
     "date": "2026-11-22T10:00:00+00:00",
     "version": "0.1.0",
     "table_sha256": "ab" * 32,
@@ -41,7 +41,7 @@ def test_a_calibration_says_when_and_from_what(arm: Case) -> None:
 
 
 def test_every_copy_keeps_it(arm: Case, tmp_path: Path) -> None:
-    provenance = Provenance(**ENTRIES)
+    provenance = Provenance(**ORIGIN)
     model = dc.CalibratedKinematics(
         arm.robot, arm.model.map, arm.model.summary, tool=[0, 0, 0.1], provenance=provenance
     )
@@ -76,12 +76,12 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
 
 
 def test_entries_that_cannot_be_read() -> None:
-    assert Provenance.from_dict(ENTRIES).to_dict() == {**ENTRIES, "command": "", "table": ""}
-    for entries in ({}, ENTRIES | {"mood": "good"}, 3):
+    assert Provenance.from_dict(ORIGIN).to_dict() == {**ORIGIN, "command": "", "table": ""}
+    for entries in ({}, ORIGIN | {"mood": "good"}, 3):
         with pytest.raises(InputError, match="the entry provenance"):
             Provenance.from_dict(entries)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="the entry 'note' of the provenance: expected text, got 3"):
-        Provenance.from_dict(ENTRIES | {"note": 3})
+        Provenance.from_dict(ORIGIN | {"note": 3})
 
 
 # --- the summary of a calibration: as a dictionary, from dictionaries of every age, and in model files --------------
