@@ -114,7 +114,7 @@ def test_extras_in_messages_and_pages_exist() -> None:
     files = [*PACKAGE.rglob("*.py"), *(root / "scripts/docs/pages").rglob("*.md")]
     text = "\n".join(path.read_text(encoding="utf-8") for path in files)
     named = set(re.findall(r"pip install \W*(?:diffeo_calib|\.)\[(\w+)\]", text))
-    assert {"camera", "collisions", "fused", "notebooks", "onnx", "ros"} == named
+    assert {"camera", "collisions", "excel", "fused", "notebooks", "onnx", "ros"} == named
     assert named <= set(re.findall(r"^(\w+) = ", table, re.MULTILINE))
 
 

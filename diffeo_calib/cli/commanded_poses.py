@@ -136,12 +136,12 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
         left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
         rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
-    found = list[tuple[float, Source]]()
+    tried = list[list[tuple[float, Source]]]()
     for lengths in UNUSUAL_LENGTHS:
-        found += _read(csv, sheet, machine, rows, body, lengths=lengths)
-        found.sort(key=lambda entry: entry[0])
-        if found and found[0][0] <= proposals.LARGEST_RESIDUAL:
+        tried.append(sorted(_read(csv, sheet, machine, rows, body, lengths=lengths), key=lambda entry: entry[0]))
+        if tried[-1] and tried[-1][0][0] <= proposals.LARGEST_RESIDUAL:
             break
+    found = min(tried, key=lambda own: own[0][0] if own else inf)
     if found and found[0][0] == inf:
         found[0][1].read_residual(found[0][1].table)  # says why
     if not found or found[0][0] > proposals.LARGEST_RESIDUAL:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,6 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-
-if sys.version_info >= (3, 11):
-    pass
-else:
-    pass  # pyright: ignore[reportMissingImports]
 
 MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
 

@@ -48,7 +48,7 @@ def test_a_pipe_that_is_no_text(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     feeder = threading.Thread(target=lambda: pipe.write_bytes(b"PK\x03\x04\xff\xfe"))
     feeder.start()
-    with pytest.raises(MeasurementError, match=says("no text", "export the table as CSV")):
+    with pytest.raises(MeasurementError, match=says("no text", "save it as .xlsx or CSV")):
         read_joints(pipe, JOINTS, SI)
     feeder.join()
 
