@@ -41,8 +41,8 @@ JOINTS = "q0", "q1"
 MOST_WAYS = 60
 """Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
-ALIKE = 6.0
-"""Ways that leave more than so many times what the best one leaves are wrong."""
+ALIKE, EXACT = 6.0, 1e-6
+"""Ways that leave more than so many times what the best one leaves are wrong; and shares that are as good as none."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,6 @@ def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
     triples = [group for group in whole(sheet.numbers, "xyz") if not group.says("rate", "deviation", "turn")]
     places = sorted((list(group.names.values()) for group in triples), key=lambda own: at[own[0]])
     ends = [0, *(at[own[0]] for own in places), len(sheet.header)]
-
     located = {name for own in places for name in own}
 
     def turn(start: int, end: int) -> list[str]:
@@ -257,9 +256,10 @@ def _alike(
     bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, seen)]
     size = max(float((place - place.mean(0)).norm(dim=1).mean()) for place, _ in bodies) or 1.0
     own, others = (_screws(*body, size) for body in bodies)
-    left = (own[:, None] - others).square().mean(2).sqrt().flatten().tolist()
+    whole = own.abs().mean(1)[:, None] + others.abs().mean(1)  # small where radians are read as degrees
+    left = ((own[:, None] - others).abs().mean(2) / whole.clamp(min=EXACT)).flatten().tolist()
     found = sorted(zip(left, product(commanded[1], seen[1]), strict=True), key=lambda entry: entry[0])
-    alike = [pair for one, pair in found if one <= ALIKE * found[0][0]][: MOST_WAYS // 2]
+    alike = [pair for one, pair in found if one <= ALIKE * max(found[0][0], EXACT)][: MOST_WAYS // 2]
     return [(*pair, camera) for pair in alike for camera in (False, True)]
 
 

@@ -356,3 +356,18 @@ def test_a_tool_is_a_rotation_vector_whatever_the_poses_are(tmp_path: Path, comm
         turns = [[float(cell) for cell in row[at : at + 3]] for row in rows]
         written.append(rotation_matrices(turns, convention, angle="deg"))
     assert_close(*written, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "wrong"), [(0.017, 0.0), (0.0, 0.2)])
+def test_noise_of_a_degree_or_a_wrong_row(noise: float, wrong: float, tmp_path: Path, init: Any) -> None:
+    """Radians that are read as degrees make all turns small, and with these what they leave."""
+    commanded = flange()
+    found = seen(commanded, camera_on_tool=False)
+    found[:, :3, :3] = turned(noise * drawn(len(found), 3, seed=11)) @ found[:, :3, :3]
+    found[5, :3, :3] = turned(torch.full((1, 3), wrong, dtype=torch.float64))[0] @ found[5, :3, :3]
+    found[5, :3, 3] += wrong / 4
+    turns = [rotation_numbers(own[:, :3, :3], "rotvec") for own in (commanded, found)]
+    poses = {"X_Y_Z": commanded[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": found[:, :3, 3]}
+    proposed, _ = init(write_columns(tmp_path / "t.csv", **poses, **{"rvec_x|rvec_y|rvec_z": turns[1]}))
+    assert (proposed["robot-pose"], proposed["angle"]) == ("X,Y,Z,RX,RY,RZ=rotvec", "rad")
+    assert (proposed["convention"], proposed["rotation-angle"]) == ("rotvec", "rad")
