@@ -55,7 +55,7 @@ JOINED = ("rotation-std",)
 """Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
-IN_FILE_OF = {"compare": "recalibrate", "report": "evaluate", "record": "images", "demo": "fit"}
+IN_FILE_OF = {"compare": "recalibrate", "report": "fit", "record": "images", "demo": "fit"}
 """Command -> that whose file holds its work."""
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""

@@ -121,3 +121,8 @@ def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_pat
     assert done.returncode == 1
     assert message in done.stderr
     assert "torch" not in done.stderr.splitlines()[-1]
+
+
+def test_evaluate_loads_nothing_that_draws() -> None:
+    program = "import sys, diffeo_calib.cli.commands.evaluate; print('matplotlib' in sys.modules)"
+    assert run_process(program=("-c", program)).out == "False\n"

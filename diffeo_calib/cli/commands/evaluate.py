@@ -1,4 +1,4 @@
-"""`diffeo-calib evaluate`: the errors of a model on a table of any kinds; `report`: a calibration on one HTML page."""
+"""`diffeo-calib evaluate`: the errors of a model on a table of measurements of any kinds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
-from diffeo_calib.cli.console import out, plain, progress_bar, say
+from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import (
     another_date_lines,
     check_payload_column,
@@ -23,7 +23,6 @@ from diffeo_calib.cli.printed import (
     accept,
     expectation_lines,
     outlier_lines,
-    parsed_length,
     parsed_limit,
     registration_lines,
     socket_lines,
@@ -31,7 +30,7 @@ from diffeo_calib.cli.printed import (
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -47,9 +46,6 @@ from diffeo_calib.kinematics.evaluation import (
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.findings import unseen
-from diffeo_calib.reports.html.sentences import advice, verdict
-from diffeo_calib.reports.report import write_report
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import MeasuringFrames
 
@@ -159,27 +155,3 @@ def _registered(model: CalibratedKinematics, data: Any, options: Command) -> Non
     say(*map(plain, (*registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")
-
-
-def run_report(wanted: Command) -> None:
-    """Write the page, and say its first line."""
-    model, data = load_kinematics(wanted.model), None
-    if wanted.data is not None:
-        data = table_of(model, wanted.data, wanted.rows, wanted.units).read(model.robot)
-    tolerance = parsed_length(wanted.tolerance, "--tolerance")
-    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
-        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
-        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
-    how = {"against": wanted.against or [], "tolerance": tolerance}
-    with progress_bar() as progress:
-        found = write_report(model, wanted.output, data, **how, progress=progress)
-    say(*provenance_lines(model))
-    words, stages = verdict(found, tolerance), dict(found.expected)
-    record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
-    record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
-    if found.shown.predictions is not None:
-        record.add(coverage_95=found.shown.predictions.coverage())
-    if data is not None and not found.shown.new:
-        each = "as fitted" if not found.errors else "each predicted by all others"
-        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words, *expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")

@@ -1,4 +1,4 @@
-"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model; `demo`: an arm to calibrate."""
+"""`diffeo-calib fit`: calibrate, show errors, write the model; `report`: a page about one; `demo`: an arm for it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
 from diffeo_calib.cli.main import app
-from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
+from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, robot_of, table_of
 from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
     outlier_lines,
+    parsed_length,
     parts_table,
     placement_lines,
     socket_lines,
@@ -30,13 +31,15 @@ from diffeo_calib.cli.printed import (
 )
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, printable
+from diffeo_calib.common.errors import PACKAGE, InputError, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.analysis.findings import unseen
+from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
@@ -219,6 +222,30 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
             f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
             f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
         )
+
+
+def run_report(wanted: Command) -> None:
+    """Write the page, and say its first line."""
+    model, data = load_kinematics(wanted.model), None
+    if wanted.data is not None:
+        data = table_of(model, wanted.data, wanted.rows, wanted.units).read(model.robot)
+    tolerance = parsed_length(wanted.tolerance, "--tolerance")
+    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
+        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
+    how = {"against": wanted.against or [], "tolerance": tolerance}
+    with progress_bar() as progress:
+        found = write_report(model, wanted.output, data, **how, progress=progress)
+    say(*provenance_lines(model))
+    words, stages = verdict(found, tolerance), dict(found.expected)
+    record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
+    record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
+    if found.shown.predictions is not None:
+        record.add(coverage_95=found.shown.predictions.coverage())
+    if data is not None and not found.shown.new:
+        each = "as fitted" if not found.errors else "each predicted by all others"
+        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
+    say(words, *expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")
 
 
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
