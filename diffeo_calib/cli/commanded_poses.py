@@ -165,7 +165,7 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
 def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
     """Units and conventions of the ways to read a table that explain it as well as each other."""
     tables = [one.table for one in alike]
-    size, several = "the size of the numbers", len(lengths) > 1
+    size, several = "the size of the numbers", len(lengths) > 1 and tables[0].joint_length is None
     size += "; which machine it is, they do not tell" * several
     sized = [replace(tables[0], length=length) for length in lengths] if several else tables[:1]
     yield from entries(sized, length=size)

@@ -184,6 +184,16 @@ def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, init: Any) -> Non
     assert '# length = "mm"' in text
 
 
+@pytest.mark.parametrize(("per_metre", "unit"), [(1.0, "m"), (1000 / 25.4, "inch")])
+def test_what_was_measured_tells_the_size_of_the_machine(
+    per_metre: float, unit: str, tmp_path: Path, init: Any
+) -> None:
+    commanded = 15.0 / per_metre * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=per_metre * commanded, x_y_z=1e3 * bent(commanded))
+    found, _ = init(table)
+    assert (found["joint-length"], found["length"]) == (unit, "mm")
+
+
 def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command, init: Any) -> None:
     commanded = flange()
     measured = seen(commanded, camera_on_tool=False)
