@@ -32,7 +32,7 @@ from diffeo_calib.cli.guesses import (
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, few
+from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
@@ -119,11 +119,9 @@ class Source:
         Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
         wrong unit the residual alone may be small too. Infinite if the table cannot be read so.
         """
-        with quiet():
-            try:
-                return self.read_residual(table)
-            except DiffeoCalibError:
-                return inf
+        with quiet(), suppress(DiffeoCalibError):
+            return self.read_residual(table)
+        return inf
 
     def residuals(self, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
         """In every format; the smallest first."""
@@ -137,7 +135,10 @@ class Source:
             check_poses(data)
         if positions is not None:
             own = positions.largest_session()
-            return likely_mistakes.residual_of(self.robot, own) / max(spread(own.points), SMALLEST_SPREAD_M)
+            if (left := likely_mistakes.residual_of(self.robot, own)) == inf:
+                what, expected = f"{len(own)} row(s) of '{self.csv}'", "enough for base and markers, at several places"
+                raise MeasurementError.of(what, expected=expected, fix="measure more rows")
+            return left / max(spread(own.points), SMALLEST_SPREAD_M)
         own, readings = divided(data)
         if own is not None:
             return _in_sockets(self.robot, own.table)

@@ -101,16 +101,17 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     assert (options["--base"], options["--tip"]) == ("base_link", "flange")
 
 
-def test_a_robot_that_explains_nothing_is_refused(tmp_path: Path, command: Command) -> None:
+@pytest.mark.parametrize(("rows", "message"), [(50, "one clear reading"), (3, "3 row(s)")])
+def test_a_robot_that_explains_nothing_is_refused(rows: int, message: str, tmp_path: Path, command: Command) -> None:
     arm, other = SimulatedArm(seed=3), SimulatedArm(seed=4)
     arm.write_urdf(tmp_path / "arm.urdf")
-    q, _ = arm.measure(50, seed=0)
-    _, points = other.measure(50, seed=9)
+    q, _ = arm.measure(rows, seed=0)
+    _, points = other.measure(rows, seed=9)
     data = dc.Measurements(q, points, arm.nominal.joint_names)
     write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"), position=("x", "y", "z"))
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "cell.toml")
     assert done.code == 1
-    assert "one clear reading" in done.error
+    assert message in done.error
     assert not (tmp_path / "cell.toml").exists()
 
 
