@@ -44,6 +44,12 @@ def test_a_bare_import_loads_nothing_slow() -> None:
     assert run(code) == ""
 
 
+def test_models_are_used_without_scipy() -> None:
+    file = PACKAGE.parent / "tests/interop/data/robot_format_3.safetensors"
+    code = f"import sys, diffeo_calib as dc; m = dc.load({str(file)!r}); m([[0.1] * m.robot.n]); dc.calibrate; "
+    assert run(code + "print('scipy' in sys.modules)") == "False"
+
+
 def test_errors_are_loaded_without_torch() -> None:
     assert run("import sys, diffeo_calib as dc; dc.DiffeoCalibError; print('torch' in sys.modules)") == "False"
 
