@@ -157,7 +157,8 @@ class SimulatedArm:
             joint: its number. factor: of the amplitudes of all its harmonics.
         """
         other, (joints, frequencies, amplitudes, phases) = copy(self), self._waves
-        grown = (joints == joint) & (torch.arange(len(joints), device=joints.device) < HARMONICS * self.nominal.n)
+        own = range(self.nominal.n)[joint]
+        grown = (joints == own) & (torch.arange(len(joints), device=joints.device) < HARMONICS * self.nominal.n)
         other._waves = joints, frequencies, torch.where(grown, factor * amplitudes, amplitudes), phases
         return other
 
